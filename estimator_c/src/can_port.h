@@ -50,6 +50,7 @@ typedef struct {
   int fd;    /* for poll/epoll (POLLIN); -1 when closed. The port reads and writes it, nobody else does */
   bool hub;  /* true: user-space hub, false: SocketCAN */
   bool gone; /* the bus has ended */
+  bool send_only;
   uint32_t ovfl_seen; /* last value of the kernel's 32-bit drop counter */
   uint32_t filter_count;
   struct can_filter filters[CAN_PORT_FILTERS_MAX]; /* applied here for the hub, in the kernel for SocketCAN */
@@ -71,7 +72,7 @@ can_port_status_t can_port_filter(can_port_t *port, const struct can_filter *fil
 
 /* Never receive anything from now on. A client that only sends MUST call this or keep reading: the hub is lossless,
  * so a client that does not read would hold everybody up and be disconnected by the hub.
- * Cost: one system call. Failure: GONE. */
+ * can_port_recv then always says EMPTY. Cost: one system call. Failure: GONE. */
 can_port_status_t can_port_send_only(can_port_t *port);
 
 /* Read the oldest frame.
