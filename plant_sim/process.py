@@ -1,0 +1,127 @@
+"""The plant as a process: the model advanced on a clock and published on a bus, or in lock-step over pipes."""
+
+import gc
+import json
+import select
+import sys
+import time
+from typing import BinaryIO
+
+import can
+
+from plant_sim.params import load_params
+from plant_sim.plant import CycleSpec, Plant
+from plant_sim.publisher import Publisher, params_sha256
+from plant_sim.sensors import SensorSpec
+from rt_runner.bus import open_bus
+from rt_runner.config import Scenario, load_scenario, with_duration
+from rt_runner.dbc import load_dbc
+from rt_runner.errors import SetupError
+from rt_runner.records import END, TICK, control, pack, read_until_control
+
+TICK_NS = 10_000_000
+TICKS_PER_INTERVAL = 10  # lock-step advances by 0.1 s
+
+
+def make_plant(scenario: Scenario, seed: int) -> Plant:
+    """The scenario's plant, advanced off line to the second it starts at."""
+    cycle, sensor = scenario.cycle, scenario.sensor
+    path = str(scenario.path.parent / cycle.path) if cycle.path else None
+    spec = CycleSpec(kind=cycle.kind, path=path, theta0_degc=cycle.theta0_degc, seed=seed)
+    sensors = SensorSpec(offset_degc=sensor.offset_degc, variance=sensor.variance, delay_s=sensor.delay_s)
+    plant = Plant(load_params(), spec, theta0_degc=cycle.theta0_degc, seed=seed, sensors=sensors)
+    plant.advance(cycle.start_s)
+    return plant
+
+
+def run_realtime(args) -> int:
+    """Publish one tick every 10 ms until the scenario's end, SIGTERM, or the end of stdin.
+
+    A late tick is sent late and counted: physics is never skipped. Returns the exit status.
+    """
+    scenario = with_duration(load_scenario(args.scenario), args.duration)
+    plant = make_plant(scenario, args.seed)
+    publisher = Publisher(load_dbc(), params_sha256(load_params()), scenario.sha256)
+    plant.step_compiled()
+    with open_bus(args.bus, receive=False) as bus:
+        _say({"ready": True, "tick": plant.tick, "t_s": plant.tick * TICK_NS / 1e9})
+        if sys.stdin.readline().strip() != "go":
+            return 0
+        gc.collect()
+        gc.disable()  # nothing here makes cycles; a collection would only be a late tick
+        ticks = round(scenario.duration_s * 100)
+        start_ns = time.monotonic_ns() + TICK_NS
+        count = 0
+        try:
+            while not ticks or count < ticks:
+                due_ns = start_ns + count * TICK_NS
+                ahead_ns = due_ns - time.monotonic_ns()
+                if ahead_ns > 0:
+                    time.sleep(ahead_ns / 1e9)
+                sample = plant.step()
+                for message in publisher.frames(sample):
+                    _send(bus, message, publisher)
+                late_ns = time.monotonic_ns() - due_ns
+                if late_ns > TICK_NS:
+                    publisher.ticks_late += 1
+                publisher.late_max_ms = max(publisher.late_max_ms, late_ns / 1e6)
+                count += 1
+                if sample.done or (count % 10 == 0 and _stdin_closed()):
+                    break
+        except can.CanOperationError as e:
+            raise SetupError(f"bus {args.bus} was lost at tick {plant.tick}: {e}; see the other processes' last words") from e
+        _say({"final": True, "ticks": count, "ticks_late": publisher.ticks_late, "late_max_ms": publisher.late_max_ms,
+              "tx_retries": publisher.tx_retries})
+    return 0
+
+
+def _send(bus: can.BusABC, message: can.Message, publisher: Publisher) -> None:
+    for _ in range(200):
+        try:
+            return bus.send(message, timeout=0.1)
+        except can.CanOperationError as e:
+            if getattr(e, "error_code", None) not in (11, 105):  # EAGAIN, ENOBUFS: the queue is full, not gone
+                raise
+            publisher.tx_retries += 1
+            time.sleep(0.0005)
+    raise can.CanOperationError("transmit queue stayed full")
+
+
+def run_lockstep(args, inp: BinaryIO, out: BinaryIO) -> int:
+    """Advance by 0.1 s for each TICK record read, writing the frames of that time and echoing the TICK.
+
+    Time on the records starts at 0 with the first tick simulated here. Writes END after the last frame.
+    """
+    scenario = with_duration(load_scenario(args.scenario), args.duration)
+    plant = make_plant(scenario, args.seed)
+    publisher = Publisher(load_dbc(), params_sha256(load_params()), scenario.sha256)
+    ticks, first = round(scenario.duration_s * 100), plant.tick
+    done = False
+    while not done:
+        try:
+            *_, mark = read_until_control(inp)
+        except EOFError:
+            return 0
+        if mark.data[0] == END:
+            return 0
+        chunk = bytearray()
+        for _ in range(TICKS_PER_INTERVAL):
+            sample = plant.step()
+            t_ns = (sample.tick - first) * TICK_NS
+            for message in publisher.frames(sample):
+                chunk += pack(t_ns, message.arbitration_id, message.data)
+            done = sample.done or (ticks > 0 and sample.tick - first >= ticks)
+            if done:
+                break
+        out.write(chunk + control((plant.tick - first) * TICK_NS, END if done else TICK))
+        out.flush()
+    return 0
+
+
+def _say(line: dict) -> None:
+    print(json.dumps(line), flush=True)
+
+
+def _stdin_closed() -> bool:
+    ready, _, _ = select.select([sys.stdin], [], [], 0)
+    return bool(ready) and sys.stdin.read(1) == ""

@@ -1,0 +1,54 @@
+"""What the plant says on the bus at each tick: samples in, CAN frames out. Knows no clock and no socket."""
+
+import hashlib
+
+import can
+
+from plant_sim.plant import PlantSample
+from rt_runner.codec import Encoder
+from rt_runner.dbc import Dbc
+
+
+class Publisher:
+    """Turns plant samples into frames at the DBC's cycle times.
+
+    Parameters
+    ----------
+    dbc : the contract
+    params_sha256, scenario_sha256 : hex digests; their first 24 bits go out as PlantIdentity
+    """
+
+    def __init__(self, dbc: Dbc, params_sha256: str, scenario_sha256: str) -> None:
+        self._encode = Encoder(dbc, "PLANT").encode
+        self._identity = {"params_hash": int(params_sha256[:6], 16), "scenario_hash": int(scenario_sha256[:6], 16)}
+        self._first_tick: int | None = None
+        self.ticks_late = 0
+        self.late_max_ms = 0.0
+        self.tx_retries = 0
+
+    def frames(self, s: PlantSample) -> list[can.Message]:
+        """Frames due at this tick, in the order they are to be sent."""
+        tick = s.tick % 65536
+        out = [self._encode("MotorState", {
+            "torque_nm": s.torque_nm, "speed_rpm": s.speed_rpm, "derating_active": 0, "tick": tick})]
+        first, self._first_tick = self._first_tick is None, self._first_tick or s.tick
+        if s.tick % 10 == 0:
+            out += [
+                self._encode("TempMeas", {"theta_w_meas_degc": s.theta_w_meas_degc,
+                                          "theta_r_meas_degc": s.theta_r_meas_degc, "tick": tick}),
+                self._encode("Reference", {"speed_demand_mps": s.v_ref_mps, "slope_rad": s.slope_rad, "tick": tick}),
+                self._encode("TruthTemp", {"theta_w_true_degc": s.theta_w_degc,
+                                           "theta_r_true_degc": s.theta_r_degc, "tick": tick}),
+                self._encode("TruthVehicle", {"v_true_mps": s.v_mps, "distance_m": s.x_m, "tick": tick}),
+            ]
+        if (s.tick - self._first_tick) % 100 == 0:
+            out.append(self._encode("PlantStatus", {
+                "ticks_late": self.ticks_late, "late_max_ms": self.late_max_ms, "tx_retries": self.tx_retries}))
+        if first or (s.tick - self._first_tick) % 1000 == 0:
+            out.append(self._encode("PlantIdentity", self._identity))
+        return out
+
+
+def params_sha256(params) -> str:
+    """Digest of a parameter set: dataclasses print their fields in a fixed order."""
+    return hashlib.sha256(repr(params).encode()).hexdigest()

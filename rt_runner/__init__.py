@@ -1,0 +1,1 @@
+"""The runner: starts, logs and judges the processes of a run. Knows no physics."""

@@ -1,0 +1,73 @@
+"""``rt-runner run``: plant and estimator over CAN in real time, logged and judged."""
+
+import argparse
+
+
+def add_parser(verbs) -> None:
+    """Add the verb."""
+    p = verbs.add_parser("run", help="plant and estimator over CAN, in real time",
+                         description="Run plant, estimator and logger on a CAN bus in real time, then judge the log.")
+    add_scenario_options(p)
+    p.add_argument("--bus", default="auto", metavar="auto|vcan0|can0|hub", help="default: vcan0 if it exists, else the hub")
+    p.add_argument("--core", type=int, help="core of the estimator (default: the last one)")
+    p.add_argument("--no-rt", action="store_true", help="do not ask for SCHED_FIFO and locked memory")
+    p.set_defaults(run=run)
+
+
+def add_scenario_options(p: argparse.ArgumentParser) -> None:
+    """Options that ``run`` and ``mil`` share."""
+    p.add_argument("scenario", nargs="?", default="hot-lap", metavar="SCENARIO", help="name or .toml file (default: hot-lap)")
+    p.add_argument("--duration", type=float, metavar="S", help="seconds, instead of the scenario's")
+    p.add_argument("--setting", help="estimator setting: default or paper")
+    p.add_argument("--period", type=float, metavar="S", help="period of the estimator's loop, 0.001 … 1")
+    p.add_argument("--log", metavar="FILE.mcap", help="default: logs/SCENARIO-TIME.mcap; an existing file is kept, renamed")
+    p.add_argument("--json", metavar="FILE", help="write the result as JSON (- for standard output)")
+    p.add_argument("--seed", type=int, default=1, help="of sensor noise and generated cycles (default: 1)")
+
+
+def scenario_from(args):
+    """The scenario that the options describe, checked."""
+    from dataclasses import replace
+
+    from rt_runner.config import check_period, load_scenario, with_duration
+    from rt_runner.errors import UsageError
+
+    s = with_duration(load_scenario(args.scenario), args.duration)
+    if args.seed < 0:
+        raise UsageError(f"--seed {args.seed}: must be 0 or more")
+    if args.period is not None:
+        check_period(args.period, "--period")
+        s = replace(s, estimator=replace(s.estimator, period_s=args.period))
+    if args.setting is not None:
+        s = replace(s, estimator=replace(s.estimator, setting=args.setting))
+    return s
+
+
+def run(args) -> int:
+    """Run; returns the exit status."""
+    import signal
+    from pathlib import Path
+
+    from rt_runner import paths
+    from rt_runner.bus import choose_bus
+    from rt_runner.mcap_log import prepare_log_path
+    from rt_runner.present import Progress, deliver
+    from rt_runner.supervisor import Plan, Supervisor
+
+    scenario = scenario_from(args)
+    paths.binary("rt_estimator")
+    bus = choose_bus(args.bus)
+    log = prepare_log_path(Path(args.log) if args.log else None, scenario.name)
+    progress = Progress(scenario.duration_s)
+    progress.line(f"{scenario.name}: {scenario.title}")
+    progress.line(f"bus: {bus.name}, {bus.reason}")
+    plan = Plan(scenario=scenario, bus=bus, log=log, seed=args.seed, core=args.core, realtime=not args.no_rt)
+    supervisor = Supervisor(plan, progress.line, progress.update)
+    before = {s: signal.signal(s, lambda *_: supervisor.stop()) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        result = supervisor.run()
+    finally:
+        progress.close()
+        for s, handler in before.items():
+            signal.signal(s, handler)
+    return deliver(result, log, args.json)

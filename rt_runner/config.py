@@ -1,0 +1,154 @@
+"""Scenarios: one TOML file says what is driven, sensed, estimated and demanded. Refused here, before anything starts."""
+
+import hashlib
+import math
+import tomllib
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+
+from rt_runner.errors import UsageError
+from rt_runner.result import Limits
+
+SCENARIO_DIR = Path(__file__).parent / "scenarios"
+
+
+@dataclass(frozen=True)
+class CycleConfig:
+    """What is driven, and from where on."""
+
+    kind: str = "lap"
+    path: str | None = None
+    start_s: float = 0.0
+    theta0_degc: float = 60.0
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """The two temperature sensors: y = theta(t - delay) + N(offset, variance)."""
+
+    offset_degc: float = -1.0
+    variance: float = 0.1
+    delay_s: float = 1.5
+
+
+@dataclass(frozen=True)
+class EstimatorConfig:
+    """Which named setting of the estimator, and the period of its loop."""
+
+    setting: str = "default"
+    period_s: float = 0.1
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One scenario, checked. ``name`` is what the user typed, ``path`` the file it came from."""
+
+    name: str
+    path: Path
+    sha256: str
+    title: str = ""
+    duration_s: float = 0.0
+    cycle: CycleConfig = field(default_factory=CycleConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
+    limits: Limits = field(default_factory=Limits)
+
+
+def scenario_names() -> list[str]:
+    """Names of the scenarios that come with the project."""
+    return sorted(p.stem for p in SCENARIO_DIR.glob("*.toml"))
+
+
+def load_scenario(name_or_path: str) -> Scenario:
+    """Read and check a scenario by name, or by the path of a TOML file.
+
+    Raises
+    ------
+    UsageError
+        Unknown name, unreadable file, unknown or ill-typed key, or a value that cannot be.
+    """
+    path = SCENARIO_DIR / f"{name_or_path}.toml"
+    if name_or_path.endswith(".toml") or "/" in name_or_path:
+        path = Path(name_or_path)
+    elif not path.is_file():
+        raise UsageError(f"unknown scenario '{name_or_path}': choose one of {', '.join(scenario_names())}, "
+                         "or give the path of a .toml file")
+    try:
+        raw = path.read_bytes()
+        tree = tomllib.loads(raw.decode())
+    except OSError as e:
+        raise UsageError(f"cannot read scenario {path}: {e.strerror}") from e
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
+        raise UsageError(f"scenario {path} is not valid TOML: {e}") from e
+    scenario = _build(tree, name_or_path if path.parent == SCENARIO_DIR else path.stem, path.resolve(), raw)
+    _check(scenario)
+    return scenario
+
+
+def _build(tree: dict, name: str, path: Path, raw: bytes) -> Scenario:
+    tables = {"cycle": CycleConfig, "sensor": SensorConfig, "estimator": EstimatorConfig, "limits": Limits}
+    values: dict = {"name": name, "path": path, "sha256": hashlib.sha256(raw).hexdigest()}
+    for key, value in tree.items():
+        if key in tables:
+            if not isinstance(value, dict):
+                raise UsageError(f"scenario {path}: '{key}' must be a table")
+            values[key] = _table(tables[key], value, f"scenario {path}, [{key}]")
+        elif key in ("title", "duration_s"):
+            values[key] = _typed(value, str if key == "title" else float, f"scenario {path}: {key}")
+        else:
+            raise UsageError(f"scenario {path}: unknown key '{key}' (known: title, duration_s, {', '.join(tables)})")
+    return Scenario(**values)
+
+
+def _table(cls, values: dict, where: str):
+    known = {f.name: f for f in fields(cls)}
+    for key in values:
+        if key not in known:
+            raise UsageError(f"{where}: unknown key '{key}' (known: {', '.join(known)})")
+    return cls(**{k: _typed(v, str if k in ("kind", "path", "setting") else float, f"{where} {k}")
+                  for k, v in values.items()})
+
+
+def _typed(value, want: type, where: str):
+    if want is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(value, want):
+        return value
+    raise UsageError(f"{where} = {value!r}: must be a {'number' if want is float else 'text'}")
+
+
+def _check(s: Scenario) -> None:
+    def refuse(why: str) -> None:
+        raise UsageError(f"scenario {s.path}: {why}")
+
+    if s.cycle.kind not in ("lap", "class3", "csv"):
+        refuse(f"[cycle] kind = '{s.cycle.kind}' is none of lap, class3, csv")
+    if (s.cycle.kind == "csv") != (s.cycle.path is not None):
+        refuse('[cycle] path belongs to kind = "csv", and that kind needs it')
+    if not (0 <= s.duration_s < math.inf and 0 <= s.cycle.start_s < math.inf):
+        refuse("duration_s and [cycle] start_s must be 0 or more")
+    if not -40 <= s.cycle.theta0_degc <= 200:
+        refuse("[cycle] theta0_degc must lie in -40 … 200")
+    if not (0 <= s.sensor.variance < math.inf and 0 <= s.sensor.delay_s <= 10 and abs(s.sensor.offset_degc) <= 100):
+        refuse("[sensor] needs variance >= 0, delay_s in 0 … 10, |offset_degc| <= 100")
+    check_period(s.estimator.period_s, f"scenario {s.path}: [estimator] period_s")
+    if not (0 < s.limits.miss_rate_max < 1):
+        refuse("[limits] miss_rate_max must lie between 0 and 1")
+    if not (s.limits.theta_w_rmse_max_degc > 0 and s.limits.theta_r_rmse_max_degc > 0):
+        refuse("[limits] temperature limits must be positive")
+
+
+def check_period(period_s: float, what: str) -> None:
+    """Refuse an estimator period that is not 1 ms … 1 s in whole microseconds."""
+    us = period_s * 1e6
+    if not (1000 <= us <= 1_000_000) or abs(us - round(us)) > 1e-6:
+        raise UsageError(f"{what} = {period_s:g}: must be 0.001 … 1 s in whole microseconds")
+
+
+def with_duration(s: Scenario, duration_s: float | None) -> Scenario:
+    """The scenario with its duration replaced, where one is given."""
+    if duration_s is None:
+        return s
+    if not 0 < duration_s < math.inf:
+        raise UsageError(f"--duration {duration_s:g}: must be positive seconds")
+    return replace(s, duration_s=duration_s)

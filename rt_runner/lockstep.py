@@ -1,0 +1,128 @@
+"""Lock-step: this process carries the frames between plant and estimator, so no clock is needed and none is read."""
+
+import contextlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from rt_runner import paths
+from rt_runner.config import Scenario
+from rt_runner.dbc import load_dbc
+from rt_runner.errors import RtError
+from rt_runner.mcap_log import LogWriter
+from rt_runner.records import CONTROL_ID, END, TICK, Record, control, pack, read_until_control
+from rt_runner.result import ResultAccumulator, RunFacts
+from rt_runner.supervisor import log_config
+
+
+class _Peer:
+    """A process that speaks records over its pipes; its standard error is kept for its last words."""
+
+    def __init__(self, name: str, command: list[str]) -> None:
+        self.name = name
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                                        start_new_session=True)  # Ctrl-C is ours to handle
+
+    def exchange(self, chunk: bytes) -> list[Record]:
+        """Send ``chunk``, which ends with a control record, and read up to the answering control record."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        try:
+            self.process.stdin.write(chunk)
+            self.process.stdin.flush()
+            return list(read_until_control(self.process.stdout))
+        except (BrokenPipeError, EOFError):
+            raise RtError(self._obituary()) from None
+
+    def json_lines(self) -> Iterator[dict]:
+        """JSON lines from standard error, up to its end."""
+        assert self.process.stderr is not None
+        for raw in self.process.stderr:
+            with contextlib.suppress(ValueError):
+                yield json.loads(raw)
+
+    def _obituary(self) -> str:
+        assert self.process.stderr is not None
+        words = [w for w in self.process.stderr.read().decode(errors="replace").splitlines() if w.strip()]
+        return f"the {self.name} ended with exit status {self.process.wait()}; its last words: {words[-1] if words else '(none)'}"
+
+    def close(self) -> None:
+        """End it, whatever it is doing."""
+        if self.process.poll() is None:
+            self.process.terminate()
+        self.process.wait()
+        for stream in (self.process.stdin, self.process.stdout, self.process.stderr):
+            if stream is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    stream.close()
+
+
+def run_lockstep(scenario: Scenario, seed: int, log: Path, progress: Callable[[dict], None]) -> dict:
+    """Run ``scenario`` in lock-step.
+
+    Record time starts at 0 and is simulated time, so the same scenario and seed give the same frames.
+
+    Returns
+    -------
+    dict
+        The result as in ``ResultAccumulator.result``; wake-up latency is None (nothing sleeps).
+
+    Raises
+    ------
+    RtError
+        A process ended early; the log up to there is complete and readable.
+    """
+    dbc = load_dbc(paths.DBC)
+    plant_command = [sys.executable, "-m", "plant_sim", "--lockstep", "--scenario", str(scenario.path), "--seed", str(seed)]
+    if scenario.duration_s:
+        plant_command += ["--duration", str(scenario.duration_s)]
+    estimator_command = [str(paths.binary("rt_estimator")), "--lockstep", "--setting", scenario.estimator.setting,
+                         "--period-us", str(round(scenario.estimator.period_s * 1e6)), "--no-rt"]
+    config = log_config(scenario, "lockstep", seed)
+    facts = RunFacts(bus="lockstep", scenario=scenario.name, period_s=scenario.estimator.period_s, lockstep=True,
+                     seed=seed, limits=scenario.limits)
+    accumulator = ResultAccumulator()
+    peers: list[_Peer] = []
+    with LogWriter(log, dbc, config["run"], config["attachments"]) as writer:
+        def take(records: list[Record]) -> None:
+            for r in records:
+                if r.can_id != CONTROL_ID:
+                    decoded = writer.write(r.t_ns, r.can_id, r.data)
+                    if decoded is not None:
+                        accumulator.feed(r.t_ns, decoded.name, decoded.values, decoded.e2e)
+                        last.update(decoded.values)
+
+        last: dict = {}
+        granted: dict = {}
+        try:
+            for name, command in (("plant", plant_command), ("estimator", estimator_command)):
+                peers.append(_Peer(name, command))
+            plant, estimator = peers
+            granted = next((line for line in estimator.json_lines() if "ready" in line), {})
+            t_ns, frames, code = 0, 0, TICK
+            while code != END:
+                answer = plant.exchange(control(t_ns, TICK))
+                t_ns, code = answer[-1].t_ns, answer[-1].data[0]
+                take(answer)
+                chunk = b"".join(pack(*r) for r in answer[:-1]) + control(t_ns, TICK)
+                back = estimator.exchange(chunk)
+                take(back)
+                frames += len(answer) + len(back) - 2
+                if t_ns % 10_000_000_000 == 0:
+                    progress({"t_s": t_ns / 1e9, "frames": frames, **{k: last.get(k) for k in (
+                        "theta_w_est_degc", "theta_w_true_degc")}})
+            take(estimator.exchange(control(t_ns, END)))
+        except RtError as e:
+            facts = replace(facts, crash=str(e), stopped_by="crash")
+        except KeyboardInterrupt:
+            facts = replace(facts, stopped_by="interrupt")
+        finally:
+            for peer in peers:
+                peer.close()
+        result = accumulator.result(replace(facts, granted=granted))
+        writer.attach("granted.json", json.dumps(granted).encode())
+        writer.metadata("result", {"json": json.dumps(result)})
+    return result

@@ -1,0 +1,34 @@
+"""Where things are: the project's root, its DBC, what was built."""
+
+import os
+from pathlib import Path
+
+from rt_runner.errors import SetupError
+
+ROOT = Path(__file__).resolve().parent.parent
+DBC = ROOT / "dbc" / "drive.dbc"
+
+
+def build_dir() -> Path:
+    """The build folder: ``RT_BUILD_DIR`` if set (a sanitizer build, say), else ``build`` in the project."""
+    return Path(os.environ.get("RT_BUILD_DIR") or ROOT / "build")
+
+
+def binary(name: str) -> Path:
+    """Path of a built program.
+
+    Raises
+    ------
+    SetupError
+        It has not been built.
+    """
+    path = build_dir() / "bin" / name
+    if not os.access(path, os.X_OK):
+        raise SetupError(f"{path} is missing: run 'make build' in {ROOT}")
+    return path
+
+
+def generated_hash(name: str) -> str | None:
+    """Contents of a small generated text file (``weights_sha256`` …), None where absent."""
+    path = build_dir() / "gen" / name
+    return path.read_text().strip() if path.is_file() else None

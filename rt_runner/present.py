@@ -1,0 +1,111 @@
+"""What a run shows its user: a progress line on a terminal, lines elsewhere, the result at the end."""
+
+import json
+import sys
+from pathlib import Path
+
+from rt_runner.errors import UsageError
+
+EXIT = {"pass": 0, "fail": 2, "inconclusive": 3}
+
+
+class Progress:
+    """A single rewritten line on a terminal; without one, plain lines, ten seconds apart.
+
+    Parameters
+    ----------
+    total_s : expected duration; 0 where the cycle decides
+    """
+
+    def __init__(self, total_s: float, stream=None) -> None:
+        self._total_s, self._stream = total_s, stream or sys.stderr
+        self._tty = self._stream.isatty()
+        self._open = False
+        self._next_s = 10.0
+
+    def line(self, text: str) -> None:
+        """One line that stays."""
+        self.close()
+        print(text, file=self._stream, flush=True)
+
+    def update(self, p: dict) -> None:
+        """Show ``{"t_s", "theta_w_est_degc", "theta_w_true_degc", "frames", "resp_us"}``; absent ones are left out."""
+        t = p.get("t_s") or 0.0
+        parts = [f"{t:6.1f} s" + (f" of {self._total_s:g}" if self._total_s else "")]
+        if p.get("theta_w_est_degc") is not None:
+            parts.append(f"winding {p['theta_w_est_degc']:6.2f} degC")
+            if p.get("theta_w_true_degc") is not None:
+                parts[-1] += f" (truth {p['theta_w_true_degc']:6.2f})"
+        if p.get("resp_us") is not None:
+            parts.append(f"response {p['resp_us']:.0f} us")
+        parts.append(f"{p.get('frames', 0)} frames")
+        text = " · ".join(parts)
+        if self._tty:
+            print(f"\r\x1b[K{text}", end="", file=self._stream, flush=True)
+            self._open = True
+        elif t >= self._next_s:
+            self._next_s = t - t % 10 + 10
+            print(text, file=self._stream, flush=True)
+
+    def close(self) -> None:
+        """Leave the progress line behind."""
+        if self._open:
+            print(file=self._stream, flush=True)
+            self._open = False
+
+
+def deliver(result: dict, log: Path, json_file: str | None) -> int:
+    """Print the result, write it where asked; returns the exit status.
+
+    Raises
+    ------
+    UsageError
+        The JSON file cannot be written.
+    """
+    write_json(result, json_file)
+    print(summary(result, log), file=sys.stderr if json_file == "-" else sys.stdout)
+    crashed = any(f["what"] == "run" and f["verdict"] == "fail" for f in result["findings"])
+    return 1 if crashed else EXIT[result["verdict"]]
+
+
+def write_json(figures: dict, json_file: str | None) -> None:
+    """Write figures as JSON to a file, to standard output for ``-``, nowhere for None."""
+    if json_file is None:
+        return
+    text = json.dumps(figures, indent=2, allow_nan=False) + "\n"
+    if json_file == "-":
+        sys.stdout.write(text)
+        return
+    path = Path(json_file)
+    try:
+        part = path.with_name(path.name + ".part")
+        part.write_text(text)
+        part.replace(path)
+    except OSError as e:
+        raise UsageError(f"cannot write --json {json_file}: {e.strerror}") from e
+
+
+def summary(result: dict, log: Path | None) -> str:
+    """The result as a few aligned lines."""
+    lines = [""]
+    for channel, title in (("theta_w", "winding"), ("theta_r", "rotor")):
+        a = result["accuracy"][channel]
+        if a["est_rmse_degc"] is not None:
+            raw = "n/a" if a["raw_rmse_degc"] is None else f"{a['raw_rmse_degc']:.3f}"
+            lines.append(f"{title:<10} estimate RMSE {a['est_rmse_degc']:.3f} degC (max {a['est_max_degc']:.3f}), "
+                         f"raw sensor {raw} degC")
+    t = result["timing"]["estimator"]
+    lines.append(f"{'jobs':<10} {t['jobs']} at {t['period_s'] * 1e3:g} ms, {t['miss_late']} late, {t['miss_skipped']} skipped")
+    for key, title in (("wake_lat_us", "wake-up"), ("exec_wall_us", "execution"), ("resp_us", "response")):
+        q = t[key]
+        if q["max"] is not None:
+            lines.append(f"{title:<10} " + ", ".join(
+                f"{k} {'n/a' if q[k] is None else format(q[k], '.1f')}" for k in ("p50", "p99", "max")) + " us")
+    g = result["granted"]
+    if g["policy"] is not None:
+        lines.append(f"{'granted':<10} {g['policy']}, core {g['core']}, memory {'locked' if g['mlock'] else 'not locked'}")
+    lines.append(f"{'log':<10} {result['log']['frames']} frames, {result['log']['dropped']} dropped" + (f", {log}" if log else ""))
+    for f in result["findings"]:
+        lines.append(f"{f['verdict']:<12} {f['what']}: {f['evidence']}")
+    lines.append(f"verdict: {result['verdict']}")
+    return "\n".join(lines)

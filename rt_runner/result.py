@@ -1,0 +1,343 @@
+"""The result of a run, computed from the frames in its log and from nothing else.
+
+``ResultAccumulator`` is fed every decoded frame in log order: by the logger while it writes, by ``inspect`` and
+the report when they read. What no frame can tell (which bus, who crashed, stolen time) comes in ``RunFacts``.
+"""
+
+import math
+from bisect import bisect_right
+from dataclasses import dataclass, field, fields
+
+from rt_runner.judge import Finding, judge_misses, overall, percentile
+
+TICK_S = 0.01
+TICK_BITS = 16
+RELEASE_BITS = 24
+SETTLE_S = 10.0  # accuracy is judged from here after the first estimate: the net's memory starts empty
+E2E_DAMAGED = (3, 4)  # wrong sequence, wrong CRC: such a frame is counted, never believed
+E2E_STATES = ("ok", "repeated", "lost", "wrong_sequence", "wrong_crc")
+STATUS_SHOWN = ("init", "starting", "ok", "predicting", "input_stale", "invalid")
+CAUSES = ("none", "late_wake", "preempted", "long_compute", "stale_input", "blocked_send")
+MACHINE_CAUSES = ("late_wake", "preempted")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a run is judged against (scenario table ``[limits]``)."""
+
+    miss_rate_max: float = 0.05
+    theta_w_rmse_max_degc: float = 0.25
+    theta_r_rmse_max_degc: float = 0.25
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """What the log's frames cannot say about a run; crosses process borders as JSON."""
+
+    bus: str = "unknown"
+    scenario: str = "unknown"
+    duration_s: float | None = None
+    period_s: float = 0.1
+    lockstep: bool = False
+    stopped_by: str = "end"  # end | interrupt | crash
+    crash: str | None = None  # which process, its exit, its last words
+    seed: int | None = None
+    granted: dict = field(default_factory=dict)
+    limits: Limits = field(default_factory=Limits)
+    steal_ms: float | None = None
+    log_dropped: int = 0  # frames the kernel or the hub dropped before the logger saw them
+
+    @staticmethod
+    def from_dict(values: dict) -> "RunFacts":
+        """Build from parsed JSON; unknown keys are ignored so that a newer runner's log can still be read."""
+        known = {f.name for f in fields(RunFacts)}
+        kept = {k: v for k, v in values.items() if k in known}
+        if isinstance(kept.get("limits"), dict):
+            names = {f.name for f in fields(Limits)}
+            kept["limits"] = Limits(**{k: v for k, v in kept["limits"].items() if k in names})
+        return RunFacts(**kept)
+
+
+class Unwrapper:
+    """Turns a counter that wraps at ``2**bits`` back into one that grows (or steps back a little)."""
+
+    def __init__(self, bits: int) -> None:
+        self._modulus = 1 << bits
+        self._last: int | None = None
+
+    def __call__(self, wrapped: float) -> int:
+        value = int(wrapped)
+        if self._last is not None:
+            half = self._modulus // 2
+            value = self._last + (value - self._last + half) % self._modulus - half
+        self._last = value
+        return value
+
+
+@dataclass
+class _Trace:
+    """A temperature pair over unwrapped ticks."""
+
+    tick: list[int] = field(default_factory=list)
+    theta_w_degc: list[float | None] = field(default_factory=list)
+    theta_r_degc: list[float | None] = field(default_factory=list)
+
+    def add(self, tick: int, theta_w: float | None, theta_r: float | None) -> None:
+        self.tick.append(tick)
+        self.theta_w_degc.append(theta_w)
+        self.theta_r_degc.append(theta_r)
+
+
+class ResultAccumulator:
+    """Collects what a result needs, frame by frame. Memory grows by about 100 bytes per temperature or job."""
+
+    def __init__(self) -> None:
+        self._ticks: dict[str, Unwrapper] = {}
+        self._truth, self._sensor, self._estimate = _Trace(), _Trace(), _Trace()
+        self._anchor: int | None = None
+        self._first_estimate_tick: int | None = None
+        self._release = Unwrapper(RELEASE_BITS)
+        self._releases: list[int] = []
+        self._late = self._warmup_jobs = self._warmup_misses = self._stale_jobs = 0
+        self._causes = dict.fromkeys(CAUSES, 0)
+        self._skips_by_cause = dict.fromkeys(CAUSES, 0)
+        self._skipped = 0
+        self._in_warmup = False
+        self._wake_us: list[float] = []
+        self._exec_us: list[float] = []
+        self._resp_us: list[float] = []
+        self._last: dict[str, dict[str, float | None]] = {}
+        self._counter: dict[str, int] = {}
+        self._frames = self._lost = self._damaged = 0
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._last_cause = "none"
+
+    def feed(self, t_ns: int, name: str, values: dict[str, float | None], e2e: int = 0) -> None:
+        """Take one decoded frame.
+
+        Parameters
+        ----------
+        t_ns : receive stamp
+        name : message name in the DBC; unknown names only count
+        values : signal -> physical value, None where not available
+        e2e : 0 ok, 1 repeated, 2 lost, 3 wrong sequence, 4 wrong CRC
+        """
+        self._frames += 1
+        self._first_ns = t_ns if self._first_ns is None else self._first_ns
+        self._last_ns = max(self._last_ns, t_ns)
+        if e2e == 4:
+            self._damaged += 1
+            return
+        counter = values.get("counter")
+        if counter is not None:
+            before = self._counter.get(name)
+            if before is not None and e2e != 1:  # a repeat is no gap
+                self._lost += (int(counter) - before - 1) % 16
+            self._counter[name] = int(counter)
+        handler = getattr(self, f"_on_{name}", None)
+        if handler is not None:
+            handler(values)
+        else:
+            self._last[name] = values
+
+    # ---- temperatures ---------------------------------------------------------------------------------
+    def _tick(self, values: dict[str, float | None]) -> int | None:
+        """Every temperature frame's tick on one common, unwrapped axis."""
+        wrapped = values.get("tick")
+        if wrapped is None:
+            return None
+        unwrap = self._ticks.setdefault("all", Unwrapper(TICK_BITS))
+        return unwrap(wrapped)
+
+    def _on_TruthTemp(self, v: dict) -> None:
+        tick = self._tick(v)
+        if tick is not None and (not self._truth.tick or tick > self._truth.tick[-1]):
+            self._truth.add(tick, v.get("theta_w_true_degc"), v.get("theta_r_true_degc"))
+
+    def _on_TempMeas(self, v: dict) -> None:
+        tick = self._tick(v)
+        if tick is not None:
+            self._sensor.add(tick, v.get("theta_w_meas_degc"), v.get("theta_r_meas_degc"))
+
+    def _on_Estimate(self, v: dict) -> None:
+        self._last["Estimate"] = v
+        tick = self._tick(v) if v.get("theta_w_est_degc") is not None else None
+        if tick is None:
+            return
+        if self._first_estimate_tick is None:
+            self._first_estimate_tick = tick
+        self._estimate.add(tick, v.get("theta_w_est_degc"), v.get("theta_r_est_degc"))
+
+    def _true_at(self, tick: int, channel: str) -> float | None:
+        """Truth between its two neighbouring samples, linear; None outside what was logged."""
+        ticks, theta = self._truth.tick, getattr(self._truth, channel)
+        i = bisect_right(ticks, tick)
+        if i == 0 or (i == len(ticks) and ticks[-1] != tick):
+            return None
+        a, b = i - 1, min(i, len(ticks) - 1)
+        if theta[a] is None or theta[b] is None:
+            return None
+        span = ticks[b] - ticks[a]
+        if span > 100:  # a second without truth is a hole, not a line
+            return None
+        return theta[a] if span == 0 else theta[a] + (theta[b] - theta[a]) * (tick - ticks[a]) / span
+
+    def _errors(self, trace: _Trace, channel: str, from_tick: int) -> list[float]:
+        out = []
+        for tick, theta in zip(trace.tick, getattr(trace, channel), strict=True):
+            true = self._true_at(tick, channel) if theta is not None and tick >= from_tick else None
+            if true is not None:
+                out.append(theta - true)
+        return out
+
+    def _accuracy(self, channel: str) -> dict[str, float | int | None]:
+        none = {"raw_rmse_degc": None, "est_rmse_degc": None, "est_max_degc": None, "samples": 0}
+        if self._first_estimate_tick is None:
+            return none
+        start = self._first_estimate_tick + round(SETTLE_S / TICK_S)
+        raw, est = (self._errors(t, channel, start) for t in (self._sensor, self._estimate))
+        return {
+            "raw_rmse_degc": _rms(raw), "est_rmse_degc": _rms(est),
+            "est_max_degc": max(map(abs, est)) if est else None, "samples": len(est),
+        }
+
+    # ---- timing ---------------------------------------------------------------------------------------
+    def _on_EstTimingA(self, v: dict) -> None:
+        if v.get("release_index") is None:
+            return
+        release = self._release(v["release_index"])
+        warmup, late = bool(v.get("warmup")), bool(v.get("miss_late"))
+        skipped = release - self._releases[-1] - 1 if self._releases else 0
+        if skipped > 0:
+            self._skipped += skipped
+            self._skips_by_cause[self._last_cause] += skipped
+        self._releases.append(release)
+        self._late += late
+        self._stale_jobs += bool(v.get("stale_input"))
+        self._in_warmup = warmup
+        self._warmup_jobs += warmup
+        self._warmup_misses += (late + max(0, skipped)) if warmup else 0
+        if not warmup and v.get("wake_lat_us") is not None:
+            self._wake_us.append(v["wake_lat_us"])
+
+    def _on_EstTimingB(self, v: dict) -> None:
+        cause = v.get("miss_cause")
+        self._last_cause = CAUSES[int(cause)] if cause is not None and int(cause) < len(CAUSES) else "none"
+        self._causes[self._last_cause] += 1
+        if self._in_warmup:
+            return
+        for key, into in (("exec_wall_us", self._exec_us), ("resp_us", self._resp_us)):
+            if v.get(key) is not None:
+                into.append(v[key])
+
+    def _count(self, message: str, signal: str) -> int:
+        value = self._last.get(message, {}).get(signal)
+        return 0 if value is None else int(value)
+
+    # ---- the result -----------------------------------------------------------------------------------
+    def result(self, facts: RunFacts) -> dict:
+        """Judge the run.
+
+        Returns
+        -------
+        dict ready for JSON: ``verdict`` (pass | fail | inconclusive), ``findings`` with the evidence, and the figures.
+        Temperatures in degC, times in us or s as named; None where a figure does not exist (n/a).
+        """
+        accuracy = {c: self._accuracy(f"{c}_degc") for c in ("theta_w", "theta_r")}
+        span_s = (self._last_ns - self._first_ns) / 1e9 if self._first_ns is not None else 0.0
+        dropped = self._lost + facts.log_dropped
+        findings = [*self._judge_run(facts), *self._judge_accuracy(accuracy, facts.limits),
+                    *self._judge_timing(facts), self._judge_log(dropped)]
+        jobs = len(self._releases)
+        return {
+            "verdict": overall(findings),
+            "findings": [vars(f) for f in findings],
+            "bus": facts.bus,
+            "scenario": facts.scenario,
+            "seed": facts.seed,
+            "duration_s": round(facts.duration_s if facts.duration_s is not None else span_s, 3),
+            "accuracy": accuracy,
+            "timing": {"estimator": {
+                "period_s": facts.period_s,
+                "jobs": jobs,
+                "releases": jobs + self._skipped,
+                "warmup_jobs": self._warmup_jobs,
+                "miss_late": self._late,
+                "miss_skipped": self._skipped,
+                "stale_jobs": self._stale_jobs,
+                "causes": {k: n for k, n in self._causes.items() if n and k != "none"},
+                "wake_lat_us": _quantiles(self._wake_us),
+                "exec_wall_us": _quantiles(self._exec_us),
+                "resp_us": _quantiles(self._resp_us),
+            }},
+            "granted": {k: facts.granted.get(k) for k in ("policy", "core", "mlock")},
+            "environment": {"steal_ms": facts.steal_ms, "warnings": facts.granted.get("warnings", [])},
+            "input_faults": {k: self._count("EstInputFaults", k) for k in ("crc_errors", "seq_errors", "stale_inputs")},
+            "bus_faults": {k: self._count("EstBusFaults", k) for k in ("rx_drops", "tx_drops", "rejected")},
+            "plant": {"ticks_late": self._count("PlantStatus", "ticks_late"),
+                      "late_max_ms": self._last.get("PlantStatus", {}).get("late_max_ms")},
+            "log": {"frames": self._frames, "dropped": dropped, "damaged": self._damaged},
+        }
+
+    def _judge_run(self, facts: RunFacts) -> list[Finding]:
+        if facts.crash:
+            return [Finding("run", "fail", facts.crash)]
+        if facts.stopped_by == "interrupt":
+            return [Finding("run", "inconclusive", "stopped by hand before its end")]
+        return []
+
+    def _judge_accuracy(self, accuracy: dict, limits: Limits) -> list[Finding]:
+        if self._first_estimate_tick is None:
+            return [Finding("accuracy", "inconclusive", "no estimate with a temperature is in the log")]
+        if not self._truth.tick:
+            return []  # a real motor has no truth; nothing to judge
+        out = []
+        for channel, limit in (("theta_w", limits.theta_w_rmse_max_degc), ("theta_r", limits.theta_r_rmse_max_degc)):
+            rmse = accuracy[channel]["est_rmse_degc"]
+            if rmse is None:
+                out.append(Finding(f"{channel} accuracy", "inconclusive",
+                                   f"nothing logged later than {SETTLE_S:g} s after the first estimate: run longer"))
+            else:
+                good = rmse <= limit
+                out.append(Finding(f"{channel} accuracy", "pass" if good else "fail",
+                                   f"RMSE {rmse:.3f} degC, limit {limit:g} degC"))
+        return out
+
+    def _judge_timing(self, facts: RunFacts) -> list[Finding]:
+        jobs = len(self._releases)
+        out = []
+        if not facts.lockstep:
+            misses = self._late + self._skipped - self._warmup_misses
+            by_machine = min(misses, sum(self._causes[c] + self._skips_by_cause[c] for c in MACHINE_CAUSES))
+            releases = jobs + self._skipped - self._warmup_jobs
+            out.append(judge_misses(min(misses, releases), by_machine, max(releases, 0), facts.limits.miss_rate_max))
+        counted = self._last.get("EstReleases", {})
+        if counted.get("releases") is not None and jobs:
+            own_jobs, own_releases = int(counted["jobs"] or 0), int(counted["releases"])
+            own_skipped = self._count("EstMisses", "miss_skipped")
+            # The counters were sent once a second; jobs logged since then are the difference, never a deficit.
+            if own_releases != own_jobs + own_skipped:
+                out.append(Finding("conservation", "fail",
+                                   f"estimator counted {own_releases} releases, but {own_jobs} jobs + {own_skipped} skipped"))
+            elif jobs < own_jobs:
+                out.append(Finding("conservation", "inconclusive",
+                                   f"estimator executed {own_jobs} jobs, only {jobs} of them are in the log"))
+            else:
+                out.append(Finding("conservation", "pass",
+                                   f"{own_releases} releases = {own_jobs} jobs + {own_skipped} skipped"))
+        return out
+
+    def _judge_log(self, dropped: int) -> Finding:
+        if dropped or self._damaged:
+            return Finding("log", "inconclusive", f"{dropped} frames missing, {self._damaged} damaged: figures may be wrong")
+        return Finding("log", "pass", f"{self._frames} frames, none missing by their counters")
+
+
+def _rms(errors: list[float]) -> float | None:
+    return math.sqrt(sum(e * e for e in errors) / len(errors)) if errors else None
+
+
+def _quantiles(samples: list[float]) -> dict[str, float | None]:
+    ordered = sorted(samples)
+    return {"p50": percentile(ordered, 50), "p99": percentile(ordered, 99), "max": ordered[-1] if ordered else None}

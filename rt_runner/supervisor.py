@@ -1,0 +1,179 @@
+"""Starts, pins, watches and stops the processes of one run; what they leave behind is the log and the result."""
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from rt_runner import machine, paths
+from rt_runner.bus import BusChoice, HubProcess
+from rt_runner.children import Child, ChildError
+from rt_runner.config import Scenario
+from rt_runner.errors import RtError
+from rt_runner.result import RunFacts
+
+READY_S = 90.0  # the plant compiles its kernel at first use and drives to the scenario's start
+ESTIMATOR_DRAIN_S = 0.25
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything a run is told before it starts."""
+
+    scenario: Scenario
+    bus: BusChoice
+    log: Path
+    seed: int = 1
+    core: int | None = None
+    realtime: bool = True
+
+
+class Supervisor:
+    """One run. ``stop()`` may be called from a signal handler; ``run()`` then ends it in order.
+
+    Parameters
+    ----------
+    plan : what to run
+    say : takes one line of text for the user
+    progress : takes the logger's progress object about once a second
+    """
+
+    def __init__(self, plan: Plan, say: Callable[[str], None], progress: Callable[[dict], None]) -> None:
+        self._plan, self._say, self._progress = plan, say, progress
+        self._core, self._others = machine.split_cores(plan.core)
+        self._stopped = False
+        self._children: list[Child] = []
+
+    def stop(self) -> None:
+        """Ask the run to end early."""
+        self._stopped = True
+
+    def run(self) -> dict:
+        """Run to the end, to ``stop()``, or to the first process that fails.
+
+        Returns
+        -------
+        dict
+            The result as in ``ResultAccumulator.result``.
+
+        Raises
+        ------
+        RtError
+            Set-up failed, or the logger itself was lost: there is no result then.
+        """
+        with HubProcess.serving(self._plan.bus) as bus:
+            logger = self._start_logger(bus)
+            try:
+                return self._run_on(bus, logger)
+            finally:
+                for child in reversed(self._children):
+                    child.stop(3.0)
+
+    def _start(self, name: str, command: list[str], cores: set[int] | None) -> Child:
+        child = Child(name, command, cores)
+        self._children.append(child)
+        return child
+
+    def _start_logger(self, bus: str) -> Child:
+        config = self._plan.log.with_suffix(".config.json")
+        config.write_text(json.dumps(self._log_config()))
+        try:
+            logger = self._start("logger", [sys.executable, "-m", "rt_runner.logger", "--bus", bus,
+                                            "--log", str(self._plan.log), "--config", str(config)], self._others)
+            logger.wait_line("ready", 30.0, lambda: self._stopped)
+        finally:
+            config.unlink(missing_ok=True)
+        return logger
+
+    def _log_config(self) -> dict:
+        plan = self._plan
+        return log_config(plan.scenario, plan.bus.name, plan.seed)
+
+    def _run_on(self, bus: str, logger: Child) -> dict:
+        plan, scenario = self._plan, self._plan.scenario
+        facts = RunFacts(bus=plan.bus.name, scenario=scenario.name, period_s=scenario.estimator.period_s,
+                         seed=plan.seed, limits=scenario.limits)
+        crash, began, steal_0 = None, time.monotonic(), machine.steal_ms(self._core)
+        try:
+            plant = self._start("plant", [sys.executable, "-m", "plant_sim", "--scenario", str(scenario.path),
+                                          "--bus", bus, "--seed", str(plan.seed), "--duration", str(scenario.duration_s)]
+                                if scenario.duration_s else
+                                [sys.executable, "-m", "plant_sim", "--scenario", str(scenario.path),
+                                 "--bus", bus, "--seed", str(plan.seed)], self._others)
+            plant.wait_line("ready", READY_S, lambda: self._stopped)
+            estimator = self._start("estimator", self._estimator_command(bus), None)
+            granted = estimator.wait_line("ready", 10.0, lambda: self._stopped)
+            facts = replace(facts, granted=granted)
+            for warning in granted.get("warnings", []):
+                self._say(f"warning: estimator: {warning}")
+            plant.tell("go")
+            began = time.monotonic()
+            self._watch(plant, estimator, logger)
+            if not self._stopped:
+                time.sleep(ESTIMATOR_DRAIN_S)  # the last interval is estimated, too
+            self._end("plant", plant)
+            self._end("estimator", estimator)
+        except ChildError as e:
+            if not self._stopped:
+                crash = str(e)
+            for child in reversed(self._children[1:]):
+                child.stop()
+        steal_1 = machine.steal_ms(self._core)
+        facts = replace(facts, duration_s=time.monotonic() - began, crash=crash,
+                        stopped_by="crash" if crash else "interrupt" if self._stopped else "end",
+                        steal_ms=None if steal_0 is None or steal_1 is None else steal_1 - steal_0)
+        return self._finish(logger, facts)
+
+    def _estimator_command(self, bus: str) -> list[str]:
+        e = self._plan.scenario.estimator
+        command = [str(paths.binary("rt_estimator")), "--bus", bus, "--setting", e.setting,
+                   "--period-us", str(round(e.period_s * 1e6)), "--core", str(self._core)]
+        return command if self._plan.realtime else [*command, "--no-rt"]
+
+    def _watch(self, plant: Child, estimator: Child, logger: Child) -> None:
+        """Until the plant is done; a child that ends before its time is an error."""
+        while not self._stopped:
+            if plant.ended():
+                if plant.process.returncode != 0:
+                    raise ChildError(plant.obituary())
+                return
+            for child in (estimator, logger):
+                if child.ended():
+                    raise ChildError(child.obituary())
+            self._drain(logger)
+            time.sleep(0.05)
+
+    def _drain(self, logger: Child) -> None:
+        while not logger.lines.empty():
+            line = logger.lines.get()
+            if line is None:
+                raise ChildError(logger.obituary())
+            if "progress" in line:
+                self._progress(line["progress"])
+            elif "error" in line:
+                raise ChildError(f"the logger: {line['error']}")
+
+    def _end(self, name: str, child: Child) -> None:
+        status = child.stop()
+        if status not in (0, -15):
+            raise ChildError(child.obituary())
+
+    def _finish(self, logger: Child, facts: RunFacts) -> dict:
+        """Hand the facts to the logger, which knows every frame; it closes the log and answers with the result."""
+        logger.tell(json.dumps({"finish": {"outcome": asdict(facts), "granted": facts.granted}}))
+        try:
+            result = logger.wait_line("result", 60.0)["result"]
+        except ChildError as e:
+            raise RtError(facts.crash if facts.crash and "logger" in facts.crash else str(e)) from e
+        logger.reap(10.0)
+        return result
+
+
+def log_config(scenario: Scenario, bus: str, seed: int) -> dict:
+    """What a log carries beside its frames: metadata ``run`` and the attachments that make the run repeatable."""
+    run = {"scenario": scenario.name, "title": scenario.title, "bus": bus, "seed": str(seed),
+           "setting": scenario.estimator.setting, "period_s": repr(scenario.estimator.period_s),
+           "scenario_sha256": scenario.sha256, **machine.describe()}
+    return {"run": run, "attachments": {"scenario.toml": str(scenario.path), "drive.dbc": str(paths.DBC)}}
