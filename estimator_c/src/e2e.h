@@ -33,7 +33,7 @@ typedef struct {
     uint8_t counter;             /* of the frame sent last */
 } e2e_sender_t;
 
-/* Receiver's side of one message. 40 bytes. Counters only grow. */
+/* Receiver's side of one message. 48 bytes. Counters only grow. */
 typedef struct {
     const uint8_t *data_id_list; /* 16 entries, outlives the object */
     uint8_t length;              /* bytes a frame must have */
