@@ -1,0 +1,86 @@
+"""Scenarios: the ones we ship load, and each thing that cannot be is refused in one line that says where."""
+
+import dataclasses
+
+import pytest
+
+from rt_runner.config import check_period, load_scenario, scenario_names, with_duration
+from rt_runner.errors import UsageError
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_shipped_scenarios_load(name):
+    s = load_scenario(name)
+    assert s.name == name
+    assert s.title
+    assert len(s.sha256) == 64
+
+
+def test_the_main_job_is_a_minute_of_the_hot_lap():
+    s = load_scenario("hot-lap")
+    assert (s.duration_s, s.cycle.kind, s.cycle.start_s) == (60.0, "lap", 400.0)
+    assert (s.sensor.offset_degc, s.sensor.variance, s.sensor.delay_s) == (-1.0, 0.1, 1.5)
+
+
+def test_a_file_of_ones_own(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('duration_s = 5\n[cycle]\nkind = "class3"\n')
+    s = load_scenario(str(path))
+    assert (s.name, s.duration_s, s.cycle.kind) == ("mine", 5.0, "class3")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("duration_s = ", "not valid TOML"),
+        ("durations = 5", "unknown key 'durations'"),
+        ('duration_s = "long"', "must be a number"),
+        ("duration_s = -1", "0 or more"),
+        ("duration_s = nan", "0 or more"),
+        ("cycle = 5", "must be a table"),
+        ('[cycle]\nkind = "moon"', "none of lap, class3, csv"),
+        ('[cycle]\nkind = "csv"', "needs it"),
+        ("[cycle]\nspeed = 1", "unknown key 'speed'"),
+        ("[sensor]\nvariance = -0.1", "variance >= 0"),
+        ("[sensor]\nvariance = true", "must be a number"),
+        ("[estimator]\nperiod_s = 0.0001", "0.001"),
+        ("[estimator]\nperiod_s = 0.0010005", "whole microseconds"),
+        ("[limits]\nmiss_rate_max = 0", "between 0 and 1"),
+        ("[limits]\ntheta_w_rmse_max_degc = 0", "positive"),
+    ],
+)
+def test_what_cannot_be_is_refused(tmp_path, text, says):
+    path = tmp_path / "bad.toml"
+    path.write_text(text)
+    with pytest.raises(UsageError) as e:
+        load_scenario(str(path))
+    assert says in str(e.value)
+    assert str(path) in str(e.value)
+    assert "\n" not in str(e.value)
+
+
+def test_unknown_scenario_names_the_known_ones():
+    with pytest.raises(UsageError, match=r"unknown scenario 'nope': choose one of .*hot-lap"):
+        load_scenario("nope")
+
+
+def test_missing_file_is_named():
+    with pytest.raises(UsageError, match="cannot read scenario gone.toml"):
+        load_scenario("./gone.toml")
+
+
+def test_duration_option():
+    s = load_scenario("hot-lap")
+    assert with_duration(s, None) is s
+    assert with_duration(s, 12.0) == dataclasses.replace(s, duration_s=12.0)
+    for bad in (0.0, -3.0, float("inf"), float("nan")):
+        with pytest.raises(UsageError, match="must be positive"):
+            with_duration(s, bad)
+
+
+def test_periods():
+    for good in (0.001, 0.0025, 0.1, 1.0):
+        check_period(good, "x")
+    for bad in (0.0, 0.0009, 1.1, float("nan")):
+        with pytest.raises(UsageError):
+            check_period(bad, "x")
