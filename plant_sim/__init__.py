@@ -1,0 +1,1 @@
+"""Vehicle, driver, electric machine and its 70-node thermal network: the truth of the closed loop."""

@@ -1,0 +1,1 @@
+"""Off-line tools: data sets, benchmarks, plots. Nothing imports them at run time."""
