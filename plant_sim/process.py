@@ -1,18 +1,20 @@
 """The plant as a process: the model advanced on a clock and published on a bus, or in lock-step over pipes."""
 
+import copy
 import gc
+import hashlib
 import json
 import select
 import sys
 import time
+from dataclasses import replace
 from typing import BinaryIO
 
 import can
 
 from plant_sim.params import load_params
 from plant_sim.plant import CycleSpec, Plant
-from plant_sim.publisher import Publisher, params_sha256
-from plant_sim.sensors import SensorSpec
+from plant_sim.publisher import Publisher
 from rt_runner.bus import open_bus
 from rt_runner.config import Scenario, load_scenario, with_duration
 from rt_runner.dbc import load_dbc
@@ -27,11 +29,17 @@ def make_plant(scenario: Scenario, seed: int) -> Plant:
     """The scenario's plant, advanced off line to the second it starts at."""
     cycle, sensor = scenario.cycle, scenario.sensor
     path = str(scenario.path.parent / cycle.path) if cycle.path else None
-    spec = CycleSpec(kind=cycle.kind, path=path, theta0_degc=cycle.theta0_degc, seed=seed)
-    sensors = SensorSpec(offset_degc=sensor.offset_degc, variance=sensor.variance, delay_s=sensor.delay_s)
-    plant = Plant(load_params(), spec, theta0_degc=cycle.theta0_degc, seed=seed, sensors=sensors)
+    params = load_params()
+    params = replace(params, sensor=replace(params.sensor, mean_k=sensor.offset_degc, variance_k2=sensor.variance,
+                                            delay_s=sensor.delay_s))
+    plant = Plant(params, CycleSpec(kind=cycle.kind, path=path, theta0_degc=cycle.theta0_degc), seed=seed)
     plant.advance(cycle.start_s)
     return plant
+
+
+def _publisher(scenario: Scenario, plant: Plant) -> Publisher:
+    digest = hashlib.sha256(repr(plant.params).encode()).hexdigest()  # dataclasses print in a fixed order
+    return Publisher(load_dbc(), digest, scenario.sha256)
 
 
 def run_realtime(args) -> int:
@@ -41,8 +49,8 @@ def run_realtime(args) -> int:
     """
     scenario = with_duration(load_scenario(args.scenario), args.duration)
     plant = make_plant(scenario, args.seed)
-    publisher = Publisher(load_dbc(), params_sha256(load_params()), scenario.sha256)
-    plant.step_compiled()
+    publisher = _publisher(scenario, plant)
+    copy.deepcopy(plant).step()  # compiles, and loads what the first step would load
     with open_bus(args.bus, receive=False) as bus:
         _say({"ready": True, "tick": plant.tick, "t_s": plant.tick * TICK_NS / 1e9})
         if sys.stdin.readline().strip() != "go":
@@ -94,7 +102,7 @@ def run_lockstep(args, inp: BinaryIO, out: BinaryIO) -> int:
     """
     scenario = with_duration(load_scenario(args.scenario), args.duration)
     plant = make_plant(scenario, args.seed)
-    publisher = Publisher(load_dbc(), params_sha256(load_params()), scenario.sha256)
+    publisher = _publisher(scenario, plant)
     ticks, first = round(scenario.duration_s * 100), plant.tick
     done = False
     while not done:

@@ -1,7 +1,5 @@
 """What the plant says on the bus at each tick: samples in, CAN frames out. Knows no clock and no socket."""
 
-import hashlib
-
 import can
 
 from plant_sim.plant import PlantSample
@@ -47,8 +45,3 @@ class Publisher:
         if first or (s.tick - self._first_tick) % 1000 == 0:
             out.append(self._encode("PlantIdentity", self._identity))
         return out
-
-
-def params_sha256(params) -> str:
-    """Digest of a parameter set: dataclasses print their fields in a fixed order."""
-    return hashlib.sha256(repr(params).encode()).hexdigest()

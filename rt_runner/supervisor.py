@@ -63,7 +63,7 @@ class Supervisor:
         RtError
             Set-up failed, or the logger itself was lost: there is no result then.
         """
-        with HubProcess.serving(self._plan.bus) as bus:
+        with HubProcess.serving(self._plan.bus, self._say) as bus:
             logger = self._start_logger(bus)
             try:
                 return self._run_on(bus, logger)
