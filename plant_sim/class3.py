@@ -1,7 +1,7 @@
 """A road cycle with the phase lengths, distances and top speeds of the class-3 regulation cycle.
 
-Not the regulation's trace: micro-trips are drawn at random, followed by a rate-limited car, and bent until each phase
-covers its distance. Seed 0 is the base trace.
+Not the regulation's trace: micro-trips are drawn at random, followed by a rate-limited car, and bent until
+each phase covers its distance. Seed 0 is the base trace.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from plant_sim.errors import CycleError
 
 @dataclass(frozen=True)
 class Phase:
-    """One phase of the cycle: regulated length, distance, top speed, standstill share; number of trips is ours."""
+    """One phase: regulated length, distance, top speed and standstill time; the number of trips is ours."""
 
     name: str
     duration_s: int
@@ -54,7 +54,7 @@ def class3_cycle(seed: int = 0, v_max_mps: float = 130.0 / 3.6) -> Cycle:
 
 
 def _phase_trace(phase: Phase, rng: np.random.Generator) -> NDArray[np.float64]:
-    """One phase at 1..duration seconds, starting and ending at rest, with the exact distance and top speed."""
+    """One phase at 1..duration seconds, from rest to rest, with the exact distance and top speed."""
     for _ in range(200):
         level, peak = _levels(phase, rng)
         low, high = 0.05, 6.0
@@ -91,7 +91,7 @@ def _levels(phase: Phase, rng: np.random.Generator) -> tuple[NDArray[np.float64]
         count = max(1, int(cruise / rng.uniform(9.0, 22.0)))
         edges = at + cruise * np.concatenate([[0.0], np.cumsum(rng.dirichlet(np.full(count, 4.0)))])
         fractions = top * rng.uniform(0.35, 0.97, count)
-        summit = int(np.argmax(np.diff(edges)[count // 3:])) + count // 3
+        summit = int(np.argmax(np.diff(edges)[count // 3 :])) + count // 3
         fractions[summit] = top
         for k in range(count):
             a, b = int(edges[k] * _SUB), int(edges[k + 1] * _SUB)
@@ -102,7 +102,9 @@ def _levels(phase: Phase, rng: np.random.Generator) -> tuple[NDArray[np.float64]
     return level, peak
 
 
-def _follow(level: NDArray[np.float64], peak: NDArray[np.bool_], bend: float, phase: Phase) -> NDArray[np.float64]:
+def _follow(
+    level: NDArray[np.float64], peak: NDArray[np.bool_], bend: float, phase: Phase
+) -> NDArray[np.float64]:
     """Speed at full seconds of a rate-limited car that follows the bent levels."""
     v_top = phase.v_top_kmh / 3.6
     # Aim above the top where it is held, and cut: the top speed is then reached exactly.

@@ -16,7 +16,15 @@ from plant_sim.track import STEP_M, speed_profile
 # Accepted header (lower case) -> factor to SI. Grade columns give rise over run, slope columns an angle.
 TIME = {"t_s": 1.0, "time_s": 1.0, "time": 1.0, "t": 1.0, "cycsecs": 1.0}
 DISTANCE = {"s_m": 1.0, "distance_m": 1.0, "distance": 1.0, "s_km": 1000.0, "distance_km": 1000.0}
-SPEED = {"v_mps": 1.0, "speed_mps": 1.0, "speed": 1.0, "v_ref_mps": 1.0, "cycmps": 1.0, "v_kmh": 1 / 3.6, "speed_kmh": 1 / 3.6}
+SPEED = {
+    "v_mps": 1.0,
+    "speed_mps": 1.0,
+    "speed": 1.0,
+    "v_ref_mps": 1.0,
+    "cycmps": 1.0,
+    "v_kmh": 1 / 3.6,
+    "speed_kmh": 1 / 3.6,
+}
 GRADE = {"grade": 1.0, "cycgrade": 1.0, "grade_percent": 0.01}
 SLOPE = {"slope_rad": 1.0, "phi_rad": 1.0}
 CURVATURE = {"kappa_1pm": 1.0, "curvature_1pm": 1.0}
@@ -24,14 +32,17 @@ _TIME_STEP_S = 0.1
 _START_MPS = 3.0
 
 
-def read_csv_cycle(path: str | Path, params: PlantParams, a_lat_mps2: float = 8.0, length_m: float | None = None) -> Cycle:
+def read_csv_cycle(
+    path: str | Path, params: PlantParams, a_lat_mps2: float = 8.0, length_m: float | None = None
+) -> Cycle:
     """Read a cycle; UTF-8 with or without byte-order mark, header in the first line.
 
     Parameters
     ----------
     path
-        CSV file with one of the columns named in this module for time or distance, speed, grade or slope. A distance
-        file without a speed may give a curvature instead: its speed is then the quasi-steady profile.
+        CSV file with one of the columns named in this module for time or distance, speed, grade or slope. A
+        distance file without a speed may give a curvature instead: its speed is then the quasi-steady
+        profile.
     params
         For the top speed, and the envelope in the speed profile.
     a_lat_mps2
@@ -50,11 +61,15 @@ def read_csv_cycle(path: str | Path, params: PlantParams, a_lat_mps2: float = 8.
     if axis is None:
         axis, by_distance = _find(header, table, DISTANCE), True
     if axis is None:
-        raise CycleError(f"{source}:1: no time or distance column; name one {' or '.join([*TIME, *DISTANCE])}")
+        raise CycleError(
+            f"{source}:1: no time or distance column; name one {' or '.join([*TIME, *DISTANCE])}"
+        )
     speed, curvature = _find(header, table, SPEED), _find(header, table, CURVATURE)
     if speed is None and (curvature is None or not by_distance):
-        raise CycleError(f"{source}:1: no speed column; name one {' or '.join(SPEED)}"
-                         + (f", or a curvature {' or '.join(CURVATURE)}" if by_distance else ""))
+        raise CycleError(
+            f"{source}:1: no speed column; name one {' or '.join(SPEED)}"
+            + (f", or a curvature {' or '.join(CURVATURE)}" if by_distance else "")
+        )
     _require_rising(source, axis)
     slope = _find(header, table, SLOPE)
     if slope is None:
@@ -90,9 +105,16 @@ def _read_table(source: Path) -> tuple[list[str], NDArray[np.float64]]:
                 if not any(cell.strip() for cell in cells):
                     continue
                 if len(cells) != len(header):
-                    raise CycleError(f"{source}:{reader.line_num}: {len(cells)} cells but {len(header)} columns; "
-                                     f"complete the line")
-                rows.append([_number(source, reader.line_num, name, cell) for name, cell in zip(header, cells, strict=True)])
+                    raise CycleError(
+                        f"{source}:{reader.line_num}: {len(cells)} cells but {len(header)} columns; "
+                        f"complete the line"
+                    )
+                rows.append(
+                    [
+                        _number(source, reader.line_num, name, cell)
+                        for name, cell in zip(header, cells, strict=True)
+                    ]
+                )
     except OSError as error:
         raise CycleError(f"{source}: cannot read the cycle ({error.strerror}); check the path") from error
     except UnicodeDecodeError as error:
@@ -115,7 +137,9 @@ def _number(source: Path, line: int, column: str, cell: str) -> float:
     return value
 
 
-def _find(header: list[str], table: NDArray[np.float64], names: dict[str, float]) -> NDArray[np.float64] | None:
+def _find(
+    header: list[str], table: NDArray[np.float64], names: dict[str, float]
+) -> NDArray[np.float64] | None:
     """Return the first column that goes by one of the names, in SI."""
     for i, name in enumerate(header):
         if name in names:
@@ -126,5 +150,7 @@ def _find(header: list[str], table: NDArray[np.float64], names: dict[str, float]
 def _require_rising(source: Path, axis: NDArray[np.float64]) -> None:
     falling = np.flatnonzero(np.diff(axis) <= 0.0)
     if falling.size:
-        raise CycleError(f"{source}: time or distance does not rise at data row {int(falling[0]) + 2}; sort the rows and "
-                         f"remove repeats")
+        raise CycleError(
+            f"{source}: time or distance does not rise at data row {int(falling[0]) + 2}; sort the rows and "
+            f"remove repeats"
+        )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +10,7 @@ from numpy.typing import NDArray
 from plant_sim.errors import CycleError
 from plant_sim.params import PlantParams
 
-Kind = Literal["lap", "class3", "csv"]
-CYCLE_KINDS: tuple[str, ...] = get_args(Kind)
+CYCLE_KINDS = ("lap", "class3", "csv")
 
 
 @dataclass(frozen=True)
@@ -28,14 +26,15 @@ class CycleSpec:
     theta0_degc
         Temperature of all nodes at the start.
     seed
-        ``class3``: 0 is the base trace, others are variants. ``lap``: the track is fixed, seed is not used for it.
+        ``class3``: 0 is the base trace, others are variants. ``lap``: the track is fixed, seed is not used
+        for it.
     a_lat_mps2
         Lateral acceleration of the speed profile on a lap or on a CSV with curvature; None takes 6.5 or 8.0.
     length_m
         Stretch a distance CSV to this length; None keeps it.
     """
 
-    kind: Kind = "lap"
+    kind: str = "lap"
     path: str | None = None
     theta0_degc: float = 60.0
     seed: int = 0
@@ -70,7 +69,8 @@ class Cycle:
     Attributes
     ----------
     by_distance
-        True: the grid is in metres (with derating the car is slower, the road must not run ahead); False: in seconds.
+        True: the grid is in metres (with derating the car is slower, the road must not run ahead); False: in
+        seconds.
     step
         Grid step in m or s.
     v_ref_mps, slope_rad
@@ -87,8 +87,14 @@ class Cycle:
     servo: GradeServo | None = None
 
     def __post_init__(self) -> None:
-        if self.v_ref_mps.shape != self.slope_rad.shape or self.v_ref_mps.ndim != 1 or self.v_ref_mps.size < 2:
-            raise CycleError(f"cycle '{self.name}': speed and slope need the same length of at least 2 samples")
+        if (
+            self.v_ref_mps.shape != self.slope_rad.shape
+            or self.v_ref_mps.ndim != 1
+            or self.v_ref_mps.size < 2
+        ):
+            raise CycleError(
+                f"cycle '{self.name}': speed and slope need the same length of at least 2 samples"
+            )
         if not self.step > 0.0:
             raise CycleError(f"cycle '{self.name}': step {self.step} must be positive")
         if not (np.isfinite(self.v_ref_mps).all() and np.isfinite(self.slope_rad).all()):
@@ -96,8 +102,10 @@ class Cycle:
         if self.v_ref_mps.min() < 0.0:
             raise CycleError(f"cycle '{self.name}': negative reference speed; the car only drives forwards")
         if self.by_distance and self.v_ref_mps[0] <= 0.0:
-            raise CycleError(f"cycle '{self.name}': reference speed at distance 0 is zero, so the car would never start; "
-                             f"give the first row a small speed such as 3 m/s")
+            raise CycleError(
+                f"cycle '{self.name}': reference speed at distance 0 is zero, so the car would never start; "
+                f"give the first row a small speed such as 3 m/s"
+            )
 
     @property
     def end(self) -> float:
@@ -107,8 +115,10 @@ class Cycle:
     def reference(self, t_s: float, x_m: float, lookahead_m: float) -> tuple[float, float]:
         """Return wanted speed (m/s) and slope (rad) at a time and place."""
         if self.by_distance:
-            return (interpolate(self.v_ref_mps, (x_m + lookahead_m) / self.step),
-                    interpolate(self.slope_rad, x_m / self.step))
+            return (
+                interpolate(self.v_ref_mps, (x_m + lookahead_m) / self.step),
+                interpolate(self.slope_rad, x_m / self.step),
+            )
         return interpolate(self.v_ref_mps, t_s / self.step), interpolate(self.slope_rad, t_s / self.step)
 
     def done(self, t_s: float, x_m: float) -> bool:
@@ -144,6 +154,8 @@ def build_cycle(spec: CycleSpec, params: PlantParams) -> Cycle:
         from plant_sim.csv_cycle import read_csv_cycle
 
         if spec.path is None:
-            raise CycleError("cycle kind 'csv' needs a file: set path to a CSV with time or distance, speed, grade")
+            raise CycleError(
+                "cycle kind 'csv' needs a file: set path to a CSV with time or distance, speed, grade"
+            )
         return read_csv_cycle(spec.path, params, a_lat_mps2=spec.a_lat_mps2 or 8.0, length_m=spec.length_m)
     raise CycleError(f"unknown cycle kind '{spec.kind}': use one of {', '.join(CYCLE_KINDS)}")

@@ -1,7 +1,7 @@
 """Stator current and flux of the machine at every (magnet temperature, torque, speed).
 
-Minimum current that meets torque and voltage limit: torque-per-ampere, field weakening and the magnet-temperature coupling
-come out of one search over i_d.
+Minimum current that meets torque and voltage limit: torque-per-ampere, field weakening and the
+magnet-temperature coupling come out of one search over i_d.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ class DqMap:
     table
         (4, 34, 57, 3): phase current peak in A, flux linkage in Vs, -i_d in A, over (theta_m, |T|, n).
     feasible
-        (4, 34, 57): whether the voltage limit could be met; elsewhere the entry is the point of least voltage.
+        (4, 34, 57): whether the voltage limit could be met; elsewhere the entry is the point of least
+        voltage.
     """
 
     table: NDArray[np.float64]
@@ -40,7 +41,7 @@ class DqMap:
         i, u = _position((theta_m_degc - THETA_GRID[0]) / 60.0, 4)
         j, v = _position(abs(torque_nm) / TORQUE_STEP_NM, self.table.shape[1])
         k, w = _position(abs(speed_rpm) / SPEED_STEP_RPM, self.table.shape[2])
-        cell = self.table[i:i + 2, j:j + 2, k:k + 2]
+        cell = self.table[i : i + 2, j : j + 2, k : k + 2]
         plane = cell[0] * (1.0 - u) + cell[1] * u
         line = plane[0] * (1.0 - v) + plane[1] * v
         current, psi, minus_id = line[0] * (1.0 - w) + line[1] * w

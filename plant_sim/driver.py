@@ -18,8 +18,16 @@ class DriverCommand(NamedTuple):
     integral_nm: float
 
 
-def driver_step(v_mps: float, v_ref_mps: float, integral_nm: float, drive_limit_nm: float, regen_limit_nm: float,
-                derate: float, dt_s: float, p: DriverParams) -> DriverCommand:
+def driver_step(
+    v_mps: float,
+    v_ref_mps: float,
+    integral_nm: float,
+    drive_limit_nm: float,
+    regen_limit_nm: float,
+    derate: float,
+    dt_s: float,
+    p: DriverParams,
+) -> DriverCommand:
     """Advance the driver by one step.
 
     Parameters
@@ -36,8 +44,8 @@ def driver_step(v_mps: float, v_ref_mps: float, integral_nm: float, drive_limit_
     Returns
     -------
     DriverCommand
-        ``regen_nm`` and ``friction_nm`` are zero or negative. At standstill with nothing wanted, all zero: the car is held by
-        its brake, not by torque.
+        ``regen_nm`` and ``friction_nm`` are zero or negative. At standstill with nothing wanted, all zero:
+        the car is held by its brake, not by torque.
     """
     if v_ref_mps <= STANDSTILL_MPS and v_mps <= STANDSTILL_MPS:
         return DriverCommand(0.0, 0.0, 0.0, 0.0)

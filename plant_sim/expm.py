@@ -23,8 +23,8 @@ def expm_integral(m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     Notes
     -----
     Taylor series of both at M / 2^s with ||M / 2^s|| <= 0.25, then s doublings
-    Phi(2M) = (I + E(M)) Phi(M) / 2 and E(2M) = E(M)^2. If the off-diagonal of M is not negative, so are both results:
-    the doublings add and multiply non-negative numbers only.
+    Phi(2M) = (I + E(M)) Phi(M) / 2 and E(2M) = E(M)^2. If the off-diagonal of M is not negative, so are both
+    results: the doublings add and multiply non-negative numbers only.
     """
     norm = float(np.max(np.sum(np.abs(m), axis=-1))) if m.size else 0.0
     squarings = max(0, int(np.ceil(np.log2(norm / _NORM)))) if norm > 0.0 else 0

@@ -24,11 +24,18 @@ def pchip(x: NDArray[np.float64], y: NDArray[np.float64], at: NDArray[np.float64
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = (w1 + w2) / (w1 / delta[:-1] + w2 / delta[1:])
     slope[1:-1] = np.where(inner, mean, 0.0)
-    slope[0], slope[-1] = _end_slope(h[0], h[1], delta[0], delta[1]), _end_slope(h[-1], h[-2], delta[-1], delta[-2])
+    slope[0], slope[-1] = (
+        _end_slope(h[0], h[1], delta[0], delta[1]),
+        _end_slope(h[-1], h[-2], delta[-1], delta[-2]),
+    )
     i = np.clip(np.searchsorted(x, at, side="right") - 1, 0, x.size - 2)
     t = (at - x[i]) / h[i]
-    return (y[i] * (1.0 + 2.0 * t) * (1.0 - t) ** 2 + h[i] * slope[i] * t * (1.0 - t) ** 2
-            + y[i + 1] * t**2 * (3.0 - 2.0 * t) + h[i] * slope[i + 1] * t**2 * (t - 1.0))
+    return (
+        y[i] * (1.0 + 2.0 * t) * (1.0 - t) ** 2
+        + h[i] * slope[i] * t * (1.0 - t) ** 2
+        + y[i + 1] * t**2 * (3.0 - 2.0 * t)
+        + h[i] * slope[i + 1] * t**2 * (t - 1.0)
+    )
 
 
 def _end_slope(h0: float, h1: float, d0: float, d1: float) -> float:

@@ -1,6 +1,7 @@
 """The plant's 10-ms step compiled with numba, for live stepping and for hours of training data.
 
-Same equations and order as `plant_sim.reference`, written as one loop over plain arrays. A test holds the two together.
+Same equations and order as `plant_sim.reference`, written as one loop over plain arrays. A test holds the
+two together.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ class Scalars(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """Arrays of the thermal network and the loss model; matrices transposed so that the inner loop runs along memory."""
+    """Arrays of network and loss model; matrices transposed so that the inner loop runs along memory."""
 
     a_t: NDArray[np.float64]
     b_t: NDArray[np.float64]
@@ -111,20 +112,56 @@ class CompiledEngine:
         servo = cycle.servo
         none = np.zeros(1)
         self._course = Course(
-            cycle.by_distance, float(cycle.step), float(cycle.end), np.ascontiguousarray(cycle.v_ref_mps, dtype=float),
-            np.ascontiguousarray(cycle.slope_rad, dtype=float), servo is not None,
+            cycle.by_distance,
+            float(cycle.step),
+            float(cycle.end),
+            np.ascontiguousarray(cycle.v_ref_mps, dtype=float),
+            np.ascontiguousarray(cycle.slope_rad, dtype=float),
+            servo is not None,
             none if servo is None else np.ascontiguousarray(servo.target_degc, dtype=float),
             none if servo is None else np.ascontiguousarray(servo.dither, dtype=float),
-            none if servo is None else np.array([servo.gain_1_k, servo.offset, servo.grade_min, servo.grade_max,
-                                                 servo.filter_s, servo.from_mps]))
+            none
+            if servo is None
+            else np.array(
+                [
+                    servo.gain_1_k,
+                    servo.offset,
+                    servo.grade_min,
+                    servo.grade_max,
+                    servo.filter_s,
+                    servo.from_mps,
+                ]
+            ),
+        )
 
-    def run(self, ticks: int, tick: int, state: NDArray[np.float64], theta: NDArray[np.float64],
-            boundary: NDArray[np.float64], derate: float, rule: tuple[float, float], stop: bool
-            ) -> NDArray[np.float64]:
+    def run(
+        self,
+        ticks: int,
+        tick: int,
+        state: NDArray[np.float64],
+        theta: NDArray[np.float64],
+        boundary: NDArray[np.float64],
+        derate: float,
+        rule: tuple[float, float],
+        stop: bool,
+    ) -> NDArray[np.float64]:
         """Advance ``state`` and ``theta`` in place; return one row per tick done."""
         rows = np.empty((ticks, N_ROW))
-        done = _run(ticks, tick, state, theta, boundary, float(derate), float(rule[0]), float(rule[1]), stop,
-                    self._scalars, self._tables, self._course, rows)
+        done = _run(
+            ticks,
+            tick,
+            state,
+            theta,
+            boundary,
+            float(derate),
+            float(rule[0]),
+            float(rule[1]),
+            stop,
+            self._scalars,
+            self._tables,
+            self._course,
+            rows,
+        )
         return rows[:done]
 
 
@@ -135,20 +172,69 @@ def _pack(params: PlantParams) -> tuple[Scalars, Tables]:
     dq_map = build_dq_map(m)
     model = LossModel(params, network, dq_map)
     rho = params.material.rho_el20_ohm_m
-    windage = c.windage_cf * pi * params.material.rho_air_kg_m3 * params.geometry.r_rotor_m**4 * params.geometry.stack_m
+    windage = (
+        c.windage_cf
+        * pi
+        * params.material.rho_air_kg_m3
+        * params.geometry.r_rotor_m**4
+        * params.geometry.stack_m
+    )
     scalars = Scalars(
-        v.mass_kg, 0.5 * v.drag_coeff * v.frontal_area_m2 * v.rho_air_kg_m3, v.roll_coeff, v.gravity_mps2,
-        v.gear_ratio / v.wheel_radius_m, 30.0 * v.gear_ratio / (pi * v.wheel_radius_m), m.torque_max_nm, m.power_max_w,
-        m.regen_torque_max_nm, m.regen_power_max_w, m.regen_v_lo_mps, m.regen_v_hi_mps, exp(-DT_S / m.torque_lag_s),
-        d.kp_nm_per_mps, d.ki_nm_per_m, d.u_min_nm, d.u_max_nm, d.integral_max_nm, d.lookahead_m, m.i_max_a,
-        float(m.pole_pairs), params.material.alpha_cu_1_k, rho * model.j_per_a**2,
-        rho * model.j_per_a**2 * model.ac_volume_m3 * c.k_ac / c.f_ac_hz**2, c.n_base_rpm, c.b_tooth_t,
-        c.b_tooth_slope / c.psi_base_vs, c.b_yoke_t, c.b_yoke_slope / c.psi_base_vs, model.teeth_kg * c.kb_fe,
-        model.yoke_kg * c.kb_fe, c.kh, c.kc, c.ke, c.harmonics, c.rotor_fe0_w, c.rotor_fe1_w, c.rotor_fe_exp, c.magnet0_w,
-        c.magnet1_w, c.magnet_exp, c.bearing0_nm, c.bearing1_nms, windage)
+        v.mass_kg,
+        0.5 * v.drag_coeff * v.frontal_area_m2 * v.rho_air_kg_m3,
+        v.roll_coeff,
+        v.gravity_mps2,
+        v.gear_ratio / v.wheel_radius_m,
+        30.0 * v.gear_ratio / (pi * v.wheel_radius_m),
+        m.torque_max_nm,
+        m.power_max_w,
+        m.regen_torque_max_nm,
+        m.regen_power_max_w,
+        m.regen_v_lo_mps,
+        m.regen_v_hi_mps,
+        exp(-DT_S / m.torque_lag_s),
+        d.kp_nm_per_mps,
+        d.ki_nm_per_m,
+        d.u_min_nm,
+        d.u_max_nm,
+        d.integral_max_nm,
+        d.lookahead_m,
+        m.i_max_a,
+        float(m.pole_pairs),
+        params.material.alpha_cu_1_k,
+        rho * model.j_per_a**2,
+        rho * model.j_per_a**2 * model.ac_volume_m3 * c.k_ac / c.f_ac_hz**2,
+        c.n_base_rpm,
+        c.b_tooth_t,
+        c.b_tooth_slope / c.psi_base_vs,
+        c.b_yoke_t,
+        c.b_yoke_slope / c.psi_base_vs,
+        model.teeth_kg * c.kb_fe,
+        model.yoke_kg * c.kb_fe,
+        c.kh,
+        c.kc,
+        c.ke,
+        c.harmonics,
+        c.rotor_fe0_w,
+        c.rotor_fe1_w,
+        c.rotor_fe_exp,
+        c.magnet0_w,
+        c.magnet1_w,
+        c.magnet_exp,
+        c.bearing0_nm,
+        c.bearing1_nms,
+        windage,
+    )
     scalars = Scalars(*(float(x) for x in scalars))
-    tables = Tables(np.ascontiguousarray(lptn.a_d.transpose(0, 2, 1)), np.ascontiguousarray(lptn.b_d.transpose(0, 2, 1)),
-                    lptn.b_b, dq_map.table, model.copper_m3, model.ac_share, model.split)
+    tables = Tables(
+        np.ascontiguousarray(lptn.a_d.transpose(0, 2, 1)),
+        np.ascontiguousarray(lptn.b_d.transpose(0, 2, 1)),
+        lptn.b_b,
+        dq_map.table,
+        model.copper_m3,
+        model.ac_share,
+        model.split,
+    )
     return scalars, tables
 
 
@@ -192,7 +278,14 @@ def _heat(theta, torque, speed, c, tab, heat):
     windage = c.windage * omega**3
     dc, ac, s = c.copper * current**2, c.ac * current**2 * f**2, tab.split
     for n in range(N_NODES):
-        q = s[n, 0] * teeth + s[n, 1] * yoke + s[n, 2] * rotor + s[n, 3] * magnet + s[n, 4] * bearing + s[n, 5] * windage
+        q = (
+            s[n, 0] * teeth
+            + s[n, 1] * yoke
+            + s[n, 2] * rotor
+            + s[n, 3] * magnet
+            + s[n, 4] * bearing
+            + s[n, 5] * windage
+        )
         if tab.copper_m3[n] > 0.0:
             resist = 1.0 + c.alpha * (theta[n] - 20.0)
             q += dc * tab.copper_m3[n] * resist + ac * tab.ac_share[n] / resist

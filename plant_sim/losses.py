@@ -37,8 +37,15 @@ class Losses:
     @property
     def total_w(self) -> float:
         """Sum of all components."""
-        return (self.copper_dc_w + self.copper_ac_w + self.teeth_w + self.yoke_w + self.rotor_fe_w + self.magnet_w
-                + self.mechanical_w)
+        return (
+            self.copper_dc_w
+            + self.copper_ac_w
+            + self.teeth_w
+            + self.yoke_w
+            + self.rotor_fe_w
+            + self.magnet_w
+            + self.mechanical_w
+        )
 
 
 class LossModel:
@@ -64,8 +71,9 @@ class LossModel:
         self.ac_share = _ac_share(params.loss.ac_inner)
         self.split = heat_split()
 
-    def heat(self, theta_degc: NDArray[np.float64], torque_nm: float, speed_rpm: float
-             ) -> tuple[NDArray[np.float64], Losses]:
+    def heat(
+        self, theta_degc: NDArray[np.float64], torque_nm: float, speed_rpm: float
+    ) -> tuple[NDArray[np.float64], Losses]:
         """Return heat per node in W (70,) and the component totals.
 
         Parameters
@@ -84,7 +92,15 @@ class LossModel:
         density2 = (self.j_per_a * current) ** 2
         resist = 1.0 + m.alpha_cu_1_k * (theta_degc - 20.0)
         dc = m.rho_el20_ohm_m * density2 * self.copper_m3 * resist
-        ac = m.rho_el20_ohm_m * density2 * self.ac_volume_m3 * c.k_ac * (f_hz / c.f_ac_hz) ** 2 * self.ac_share / resist
+        ac = (
+            m.rho_el20_ohm_m
+            * density2
+            * self.ac_volume_m3
+            * c.k_ac
+            * (f_hz / c.f_ac_hz) ** 2
+            * self.ac_share
+            / resist
+        )
         harmonic = 1.0 + c.harmonics * (minus_id / p.machine.i_max_a) * nu
         b_tooth = c.b_tooth_t * tanh(c.b_tooth_slope * psi / c.psi_base_vs)
         b_yoke = c.b_yoke_t * tanh(c.b_yoke_slope * psi / c.psi_base_vs)
@@ -93,7 +109,9 @@ class LossModel:
         rotor = (c.rotor_fe0_w + c.rotor_fe1_w * load) * nu**c.rotor_fe_exp
         magnet = (c.magnet0_w + c.magnet1_w * load) * nu**c.magnet_exp
         bearing = 2.0 * (c.bearing0_nm + c.bearing1_nms * omega) * omega
-        windage = c.windage_cf * pi * m.rho_air_kg_m3 * omega**3 * p.geometry.r_rotor_m**4 * p.geometry.stack_m
+        windage = (
+            c.windage_cf * pi * m.rho_air_kg_m3 * omega**3 * p.geometry.r_rotor_m**4 * p.geometry.stack_m
+        )
         heat = dc + ac + self.split @ np.array([teeth, yoke, rotor, magnet, bearing, windage])
         return heat, Losses(float(dc.sum()), float(ac.sum()), teeth, yoke, rotor, magnet, bearing, windage)
 
@@ -107,8 +125,16 @@ def heat_split() -> NDArray[np.float64]:
     """Share of each non-copper component that enters each node, (70, 6) in the order of SPLIT_COLUMNS."""
     split = np.zeros((N_NODES, len(SPLIT_COLUMNS)))
     for s in SLICES:
-        for name, column, share in (("T1", 0, 0.40), ("T2", 0, 0.60), ("YO", 1, 0.45), ("YI", 1, 0.55), ("RS", 2, 0.85),
-                                    ("RC", 2, 0.15), ("MG", 3, 1.0), ("AG", 5, 1.0)):
+        for name, column, share in (
+            ("T1", 0, 0.40),
+            ("T2", 0, 0.60),
+            ("YO", 1, 0.45),
+            ("YI", 1, 0.55),
+            ("RS", 2, 0.85),
+            ("RC", 2, 0.15),
+            ("MG", 3, 1.0),
+            ("AG", 5, 1.0),
+        ):
             split[INDEX[f"{name}_{s}"], column] = share / 3.0
     for s in SIDES:
         split[INDEX[f"BI_{s}"], 4] = split[INDEX[f"BO_{s}"], 4] = 0.25

@@ -1,7 +1,8 @@
 """The 70-node thermal network as an exact zero-order-hold step on a speed grid.
 
-theta+ = A_d(n) theta + B_d(n) P + B_b(n) theta_b, with the matrices of the two neighbouring grid speeds blended. The step is
-positive and contractive by construction and stays stable for the 5 ms air-gap nodes at any step length.
+theta+ = A_d(n) theta + B_d(n) P + B_b(n) theta_b, with the matrices of the two neighbouring grid speeds
+blended. The step is positive and contractive by construction and stays stable for the 5 ms air-gap nodes at
+any step length.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ class Lptn:
     a_d, b_d
         (113, 70, 70) state and heat matrices; b_d in K/W.
     b_b
-        (113, 70, 3) response to coolant, ambient and gearbox temperature; kept apart so that they may vary in time.
+        (113, 70, 3) response to coolant, ambient and gearbox temperature; kept apart so that they may vary
+        in time.
     dt_s
         Step length.
     """
@@ -41,8 +43,13 @@ class Lptn:
     dt_s: float
     grid_rpm: float
 
-    def step(self, theta_degc: NDArray[np.float64], heat_w: NDArray[np.float64], speed_rpm: float,
-             boundary_degc: NDArray[np.float64]) -> NDArray[np.float64]:
+    def step(
+        self,
+        theta_degc: NDArray[np.float64],
+        heat_w: NDArray[np.float64],
+        speed_rpm: float,
+        boundary_degc: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
         """Return the 70 node temperatures one step later.
 
         Parameters

@@ -1,7 +1,7 @@
 """Heat capacities and conductances of the machine, derived from geometry and material.
 
-A plane wall gives k A / d, a cylinder shell 2 pi k L / ln(r_o / r_i); resistances in series add. Convection follows
-Gnielinski (jacket), Becker and Kaye (air gap) and Schubert (end space).
+A plane wall gives k A / d, a cylinder shell 2 pi k L / ln(r_o / r_i); resistances in series add. Convection
+follows Gnielinski (jacket), Becker and Kaye (air gap) and Schubert (end space).
 """
 
 from __future__ import annotations
@@ -58,15 +58,22 @@ class Network:
 
 def build_network(params: PlantParams) -> Network:
     """Derive capacities and speed-independent conductances from the parameters."""
-    return Network(params, _capacities(params), _copper_volumes(params), static_links(params),
-                   params.coolant.rho * params.coolant.flow_lpm / 60e3 * params.coolant.cp)
+    return Network(
+        params,
+        _capacities(params),
+        _copper_volumes(params),
+        static_links(params),
+        params.coolant.rho * params.coolant.flow_lpm / 60e3 * params.coolant.cp,
+    )
 
 
 def jacket_h(params: PlantParams) -> float:
     """Heat transfer coefficient of the coolant jacket in W/(m2 K) (Gnielinski; laminar floor Nu = 4.36)."""
     c = params.coolant
     if not c.flow_lpm > 0.0:
-        raise ParameterError(f"coolant.flow_lpm = {c.flow_lpm} must be positive; for a dead pump use 0.1 L/min")
+        raise ParameterError(
+            f"coolant.flow_lpm = {c.flow_lpm} must be positive; for a dead pump use 0.1 L/min"
+        )
     area, wetted = c.duct_width_m * c.duct_height_m, 2.0 * (c.duct_width_m + c.duct_height_m)
     d_h = 4.0 * area / wetted
     reynolds = c.rho * (c.flow_lpm / 60e3 / area) * d_h / c.mu_pa_s
@@ -124,9 +131,17 @@ def speed_links(params: PlantParams, speed_rpm: float) -> list[Link]:
     for s in SLICES:
         links += [(f"AG_{s}", f"RS_{s}", rotor), (f"AG_{s}", f"T2_{s}", bore)]
     links += [("AG_DE", "AG_M", mixing), ("AG_M", "AG_NDE", mixing)]
-    areas = {"ERO": c.area_root_outer_m2, "ERI": c.area_root_inner_m2, "ECO": c.area_crown_outer_m2,
-             "ECI": c.area_crown_inner_m2, "SF": c.area_flange_m2, "OH": c.area_overhang_m2,
-             "RP": c.area_end_plate_m2 * c.rotating_gain, "SHF": c.area_shaft_m2 * c.rotating_gain, "SH": c.area_hub_m2}
+    areas = {
+        "ERO": c.area_root_outer_m2,
+        "ERI": c.area_root_inner_m2,
+        "ECO": c.area_crown_outer_m2,
+        "ECI": c.area_crown_inner_m2,
+        "SF": c.area_flange_m2,
+        "OH": c.area_overhang_m2,
+        "RP": c.area_end_plate_m2 * c.rotating_gain,
+        "SHF": c.area_shaft_m2 * c.rotating_gain,
+        "SH": c.area_hub_m2,
+    }
     for s in SIDES:
         links.append((f"AG_{s}", f"EA_{s}", mixing))
         links += [(f"EA_{s}", f"{name}_{s}", h_end * area) for name, area in areas.items()]
@@ -142,7 +157,10 @@ def boundary_links(params: PlantParams, speed_rpm: float) -> list[tuple[str, int
     links = [(f"HO_{s}", AMBIENT, h * 2.0 * pi * r_out * g.stack_m / 3.0) for s in SLICES]
     links += [(f"OH_{s}", AMBIENT, h * 2.0 * pi * r_out * g.overhang_m) for s in SIDES]
     links.append(("SF_NDE", AMBIENT, h * c.flange_outer_area_m2))
-    links += [("SF_DE", GEARBOX, params.contact.g_flange_gear_w_k), ("SHF_DE", GEARBOX, params.contact.g_shaft_gear_w_k)]
+    links += [
+        ("SF_DE", GEARBOX, params.contact.g_flange_gear_w_k),
+        ("SHF_DE", GEARBOX, params.contact.g_shaft_gear_w_k),
+    ]
     return links
 
 
@@ -178,7 +196,11 @@ def _slice_links(params: PlantParams) -> list[Link]:
     ls = g.stack_m / 3.0
     r_hi, split = g.r_stator_m + g.t_housing_inner_m, _yoke_split(params)
     r_jacket = r_hi + g.jacket_height_m
-    r_hi_mid, r_yo, r_yi = g.r_stator_m + g.t_housing_inner_m / 2, (split + g.r_stator_m) / 2, (split + g.r_slot_bottom_m) / 2
+    r_hi_mid, r_yo, r_yi = (
+        g.r_stator_m + g.t_housing_inner_m / 2,
+        (split + g.r_stator_m) / 2,
+        (split + g.r_slot_bottom_m) / 2,
+    )
     h_c = jacket_h(params) * params.coolant.cover
     tooth_area = g.slots * g.tooth_width_m * ls * g.stack_factor
     half_tooth = (g.r_slot_bottom_m - g.r_bore_m) / 2
@@ -191,30 +213,53 @@ def _slice_links(params: PlantParams) -> list[Link]:
     to_gap = half_slot / (quarter + c.r_wedge_m2k_w + 1.0 / c.h_wedge_w_m2k)
     layers = m.k_winding * half_slot / (g.slot_height_m / 2)
     core_periphery = m.k_winding * side / (g.slot_width_m / 4)
-    magnet = g.magnet_count * g.magnet_width_m * ls / (c.t_glue_m / c.k_glue + g.magnet_half_path_m / m.k_magnet)
+    magnet = (
+        g.magnet_count * g.magnet_width_m * ls / (c.t_glue_m / c.k_glue + g.magnet_half_path_m / m.k_magnet)
+    )
     return [
         ("CO", "HI", _series(h_c * 2 * pi * r_hi * ls, _shell(m.k_al, ls, r_hi_mid, r_hi))),
         ("CO", "HO", h_c * 2 * pi * r_jacket * ls),
-        ("HI", "YO", _series(m.k_air / c.g_stack_housing_m * 2 * pi * g.r_stator_m * ls,
-                             _shell(m.k_al, ls, g.r_stator_m, r_hi_mid), _shell(m.k_fe_radial, ls, r_yo, g.r_stator_m))),
+        (
+            "HI",
+            "YO",
+            _series(
+                m.k_air / c.g_stack_housing_m * 2 * pi * g.r_stator_m * ls,
+                _shell(m.k_al, ls, g.r_stator_m, r_hi_mid),
+                _shell(m.k_fe_radial, ls, r_yo, g.r_stator_m),
+            ),
+        ),
         ("YO", "YI", _shell(m.k_fe_radial, ls, r_yi, r_yo)),
-        ("YI", "T1", _series(m.k_fe_radial * tooth_area / (half_tooth / 2),
-                             _shell(m.k_fe_radial, ls, g.r_slot_bottom_m, r_yi))),
+        (
+            "YI",
+            "T1",
+            _series(
+                m.k_fe_radial * tooth_area / (half_tooth / 2),
+                _shell(m.k_fe_radial, ls, g.r_slot_bottom_m, r_yi),
+            ),
+        ),
         ("T1", "T2", m.k_fe_radial * tooth_area / half_tooth),
-        ("WOc", "WOp", core_periphery), ("WIc", "WIp", core_periphery),
-        ("WOp", "T1", to_tooth), ("WIp", "T2", to_tooth),
-        ("WOp", "WIp", layers), ("WOc", "WIc", layers),
-        ("WOp", "YI", to_yoke), ("WOc", "YI", to_yoke),
-        ("WIp", "AG", to_gap), ("WIc", "AG", to_gap),
-        ("RS", "MG", magnet), ("MG", "RC", magnet),
+        ("WOc", "WOp", core_periphery),
+        ("WIc", "WIp", core_periphery),
+        ("WOp", "T1", to_tooth),
+        ("WIp", "T2", to_tooth),
+        ("WOp", "WIp", layers),
+        ("WOc", "WIc", layers),
+        ("WOp", "YI", to_yoke),
+        ("WOc", "YI", to_yoke),
+        ("WIp", "AG", to_gap),
+        ("WIc", "AG", to_gap),
+        ("RS", "MG", magnet),
+        ("MG", "RC", magnet),
         ("RS", "RC", g.rim_core_share * _shell(m.k_fe_radial, ls, g.r_core_mid_m, g.r_rim_mid_m)),
     ]
 
 
 def _core_to_shaft(params: PlantParams) -> float:
     g, ls = params.geometry, params.geometry.stack_m / 3.0
-    return _series(params.contact.h_core_shaft_w_m2k * 2 * pi * g.r_shaft_m * ls,
-                   g.core_shaft_share * _shell(params.material.k_fe_radial, ls, g.r_shaft_m, g.r_core_to_shaft_m))
+    return _series(
+        params.contact.h_core_shaft_w_m2k * 2 * pi * g.r_shaft_m * ls,
+        g.core_shaft_share * _shell(params.material.k_fe_radial, ls, g.r_shaft_m, g.r_core_to_shaft_m),
+    )
 
 
 def _axial_links(params: PlantParams) -> list[tuple[str, float]]:
@@ -227,9 +272,14 @@ def _axial_links(params: PlantParams) -> list[tuple[str, float]]:
     return [
         ("HI", m.k_al * _ring(g.r_stator_m, r_hi) / ls),
         ("HO", m.k_al * _ring(r_jacket, r_jacket + g.t_housing_outer_m) / ls),
-        ("YO", m.k_fe_axial * _ring(split, g.r_stator_m) / ls), ("YI", m.k_fe_axial * _ring(g.r_slot_bottom_m, split) / ls),
-        ("T1", m.k_fe_axial * tooth / ls), ("T2", m.k_fe_axial * tooth / ls),
-        ("WOp", copper), ("WOc", copper), ("WIp", copper), ("WIc", copper),
+        ("YO", m.k_fe_axial * _ring(split, g.r_stator_m) / ls),
+        ("YI", m.k_fe_axial * _ring(g.r_slot_bottom_m, split) / ls),
+        ("T1", m.k_fe_axial * tooth / ls),
+        ("T2", m.k_fe_axial * tooth / ls),
+        ("WOp", copper),
+        ("WOc", copper),
+        ("WIp", copper),
+        ("WIc", copper),
         ("RS", m.k_fe_axial * _ring(g.r_rim_m, g.r_rotor_m) / ls),
         ("MG", m.k_magnet * g.magnet_count * g.magnet_width_m * g.magnet_thickness_m / ls),
         ("RC", m.k_fe_axial * g.rotor_solid * _ring(g.r_shaft_m, g.r_rim_m) / ls),
@@ -248,16 +298,27 @@ def _side_links(params: PlantParams) -> list[Link]:
     r_jacket = r_hi + g.jacket_height_m
     overlap = (ls + g.overhang_m) / 2
     return [
-        ("WOp", "ERO", to_root), ("WOc", "ERO", to_root), ("WIp", "ERI", to_root), ("WIc", "ERI", to_root),
-        ("ERO", "ECO", to_crown), ("ERI", "ECI", to_crown),
-        ("ERO", "ERI", c.g_root_layers_w_k), ("ECO", "ECI", c.g_crown_layers_w_k),
-        ("ECO", "OH", c.g_crown_overhang_w_k), ("ERO", "OH", c.g_root_overhang_w_k),
-        ("SH", "SF", c.g_hub_flange_w_k), ("SF", "OH", c.g_flange_overhang_w_k), ("BO", "SH", c.g_outer_race_hub_w_k),
-        ("BI", "BO", c.g_bearing_w_k), ("BI", "SHF", c.g_inner_race_shaft_w_k),
+        ("WOp", "ERO", to_root),
+        ("WOc", "ERO", to_root),
+        ("WIp", "ERI", to_root),
+        ("WIc", "ERI", to_root),
+        ("ERO", "ECO", to_crown),
+        ("ERI", "ECI", to_crown),
+        ("ERO", "ERI", c.g_root_layers_w_k),
+        ("ECO", "ECI", c.g_crown_layers_w_k),
+        ("ECO", "OH", c.g_crown_overhang_w_k),
+        ("ERO", "OH", c.g_root_overhang_w_k),
+        ("SH", "SF", c.g_hub_flange_w_k),
+        ("SF", "OH", c.g_flange_overhang_w_k),
+        ("BO", "SH", c.g_outer_race_hub_w_k),
+        ("BI", "BO", c.g_bearing_w_k),
+        ("BI", "SHF", c.g_inner_race_shaft_w_k),
         ("OH", "HI", m.k_al * _ring(g.r_stator_m, r_hi) / overlap),
         ("OH", "HO", m.k_al * _ring(r_jacket, r_jacket + g.t_housing_outer_m) / overlap),
         ("CO", "OH", jacket_h(params) * 2 * pi * r_hi * g.overhang_jacket_m),
-        ("RP", "RC", c.g_end_plate_core_w_k), ("RP", "RS", c.g_end_plate_rim_w_k), ("RP", "MG", c.g_end_plate_magnet_w_k),
+        ("RP", "RC", c.g_end_plate_core_w_k),
+        ("RP", "RS", c.g_end_plate_rim_w_k),
+        ("RP", "MG", c.g_end_plate_magnet_w_k),
     ]
 
 
@@ -286,19 +347,34 @@ def _capacities(params: PlantParams) -> NDArray[np.float64]:
     tooth = fe * g.slots * g.tooth_width_m * (g.r_slot_bottom_m - g.r_bore_m) / 2 * ls
     cap: dict[str, float] = {}
     for s in SLICES:
-        cap |= {f"CO_{s}": params.coolant.rho * params.coolant.cp * _ring(r_hi, r_jacket) * ls * params.coolant.cover,
-                f"HI_{s}": al * _ring(g.r_stator_m, r_hi) * ls, f"YO_{s}": fe * _ring(split, g.r_stator_m) * ls,
-                f"YI_{s}": fe * _ring(g.r_slot_bottom_m, split) * ls, f"T1_{s}": tooth, f"T2_{s}": tooth,
-                f"AG_{s}": g.gap_capacity_j_k, f"RS_{s}": fe * g.rim_solid * _ring(g.r_rim_m, g.r_rotor_m) * ls,
-                f"MG_{s}": g.magnet_mass_kg / 3 * m.c_magnet,
-                f"RC_{s}": fe * g.rotor_solid * _ring(g.r_shaft_m, g.r_rim_m) * ls,
-                f"HO_{s}": al * _ring(r_jacket, r_out) * ls,
-                f"SHF_{s}": steel * pi * g.r_shaft_m**2 * (g.stack_m if s == "M" else g.shaft_end_m)}
+        cap |= {
+            f"CO_{s}": params.coolant.rho
+            * params.coolant.cp
+            * _ring(r_hi, r_jacket)
+            * ls
+            * params.coolant.cover,
+            f"HI_{s}": al * _ring(g.r_stator_m, r_hi) * ls,
+            f"YO_{s}": fe * _ring(split, g.r_stator_m) * ls,
+            f"YI_{s}": fe * _ring(g.r_slot_bottom_m, split) * ls,
+            f"T1_{s}": tooth,
+            f"T2_{s}": tooth,
+            f"AG_{s}": g.gap_capacity_j_k,
+            f"RS_{s}": fe * g.rim_solid * _ring(g.r_rim_m, g.r_rotor_m) * ls,
+            f"MG_{s}": g.magnet_mass_kg / 3 * m.c_magnet,
+            f"RC_{s}": fe * g.rotor_solid * _ring(g.r_shaft_m, g.r_rim_m) * ls,
+            f"HO_{s}": al * _ring(r_jacket, r_out) * ls,
+            f"SHF_{s}": steel * pi * g.r_shaft_m**2 * (g.stack_m if s == "M" else g.shaft_end_m),
+        }
     for s in SIDES:
-        cap |= {f"EA_{s}": m.rho_air_kg_m3 * m.c_air * g.end_air_volume_m3, f"SF_{s}": g.flange_mass_kg * m.c_al,
-                f"SH_{s}": g.hub_mass_kg * m.c_al, f"BI_{s}": g.bearing_inner_mass_kg * m.c_steel,
-                f"BO_{s}": g.bearing_outer_mass_kg * m.c_steel, f"RP_{s}": g.end_plate_mass_kg * m.c_al,
-                f"OH_{s}": al * _ring(g.r_stator_m, r_out) * g.overhang_m * g.overhang_solid}
+        cap |= {
+            f"EA_{s}": m.rho_air_kg_m3 * m.c_air * g.end_air_volume_m3,
+            f"SF_{s}": g.flange_mass_kg * m.c_al,
+            f"SH_{s}": g.hub_mass_kg * m.c_al,
+            f"BI_{s}": g.bearing_inner_mass_kg * m.c_steel,
+            f"BO_{s}": g.bearing_outer_mass_kg * m.c_steel,
+            f"RP_{s}": g.end_plate_mass_kg * m.c_al,
+            f"OH_{s}": al * _ring(g.r_stator_m, r_out) * g.overhang_m * g.overhang_solid,
+        }
     out = np.zeros(N_NODES)
     for name, value in cap.items():
         out[INDEX[name]] = value

@@ -29,6 +29,7 @@ class VehicleParams:
     rho_air_kg_m3: float
     gravity_mps2: float
 
+
 @dataclass(frozen=True)
 class MachineParams:
     """Electric machine: torque envelope and dq parameters (peak-phase values)."""
@@ -50,6 +51,7 @@ class MachineParams:
     i_max_a: float
     turns_series: int
 
+
 @dataclass(frozen=True)
 class DriverParams:
     """PI driver; torques at the machine shaft."""
@@ -60,6 +62,7 @@ class DriverParams:
     u_max_nm: float
     integral_max_nm: float
     lookahead_m: float
+
 
 @dataclass(frozen=True)
 class GeometryParams:
@@ -109,6 +112,7 @@ class GeometryParams:
     end_air_volume_m3: float
     gap_capacity_j_k: float
 
+
 @dataclass(frozen=True)
 class MaterialParams:
     """Thermal and electrical material constants; k in W/(m K), rho in kg/m3, c in J/(kg K)."""
@@ -141,6 +145,7 @@ class MaterialParams:
     rho_el20_ohm_m: float
     alpha_cu_1_k: float
 
+
 @dataclass(frozen=True)
 class ContactParams:
     """Interface resistances and conductances that no formula gives."""
@@ -169,6 +174,7 @@ class ContactParams:
     g_end_plate_rim_w_k: float
     g_end_plate_magnet_w_k: float
 
+
 @dataclass(frozen=True)
 class CoolantParams:
     """Glycol jacket: helical duct, 50/50 water-glycol."""
@@ -182,6 +188,7 @@ class CoolantParams:
     duct_height_m: float
     cover: float
     enhancement: float
+
 
 @dataclass(frozen=True)
 class ConvectionParams:
@@ -209,6 +216,7 @@ class ConvectionParams:
     ambient_exp: float
     flange_outer_area_m2: float
 
+
 @dataclass(frozen=True)
 class BoundaryParams:
     """Temperatures that the surroundings impose."""
@@ -216,6 +224,7 @@ class BoundaryParams:
     coolant_degc: float
     ambient_degc: float
     gearbox_degc: float
+
 
 @dataclass(frozen=True)
 class LossParams:
@@ -244,6 +253,7 @@ class LossParams:
     bearing0_nm: float
     bearing1_nms: float
     windage_cf: float
+
 
 @dataclass(frozen=True)
 class SensorParams:
@@ -287,10 +297,14 @@ class PlantParams:
         grouped: dict[str, dict[str, float]] = {}
         for key, value in changes.items():
             group, _, name = key.partition("__")
-            known = {f.name for f in dataclasses.fields(getattr(self, group))} if hasattr(self, group) else set()
+            known = (
+                {f.name for f in dataclasses.fields(getattr(self, group))} if hasattr(self, group) else set()
+            )
             if name not in known:
-                raise ParameterError(f"plant parameter '{key}' does not exist: use group__name with a group of "
-                                     f"{', '.join(f.name for f in dataclasses.fields(self))}")
+                raise ParameterError(
+                    f"plant parameter '{key}' does not exist: use group__name with a group of "
+                    f"{', '.join(f.name for f in dataclasses.fields(self))}"
+                )
             _require_finite(key, value)
             grouped.setdefault(group, {})[name] = value
         groups: dict[str, Any] = {g: dataclasses.replace(getattr(self, g), **c) for g, c in grouped.items()}
@@ -309,9 +323,13 @@ def load_params(path: str | Path | None = None) -> PlantParams:
     try:
         raw = json.loads(source.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ParameterError(f"{source}: cannot read plant parameters ({error.strerror}); check the path") from error
+        raise ParameterError(
+            f"{source}: cannot read plant parameters ({error.strerror}); check the path"
+        ) from error
     except json.JSONDecodeError as error:
-        raise ParameterError(f"{source}:{error.lineno}: not valid JSON ({error.msg}); repair the file") from error
+        raise ParameterError(
+            f"{source}:{error.lineno}: not valid JSON ({error.msg}); repair the file"
+        ) from error
     if not isinstance(raw, dict):
         raise ParameterError(f"{source}: top level must be an object of parameter groups")
     groups = {}
@@ -329,8 +347,10 @@ def _build(source: Path, group: str, cls: type, values: object) -> Any:
     if not isinstance(values, dict):
         raise ParameterError(f"{source}: group '{group}' is missing; it needs {sorted(names)}")
     if set(values) != names:
-        raise ParameterError(f"{source}: group '{group}': missing {sorted(names - set(values))}, "
-                             f"unknown {sorted(set(values) - names)}")
+        raise ParameterError(
+            f"{source}: group '{group}': missing {sorted(names - set(values))}, "
+            f"unknown {sorted(set(values) - names)}"
+        )
     for name, value in values.items():
         _require_finite(f"{source}: {group}.{name}", value)
     return cls(**values)

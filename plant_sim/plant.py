@@ -17,8 +17,18 @@ from plant_sim.lptn import DT_S
 from plant_sim.nodes import HOT_SPOT, N_NODES, THETA_R, THETA_W
 from plant_sim.params import PlantParams
 from plant_sim.sensors import TemperatureSensor
-from plant_sim.state import (N_STATE, ROW_SLOPE, ROW_SPEED, ROW_THETA_R, ROW_THETA_W, ROW_TORQUE, ROW_V, ROW_V_REF, ROW_X,
-                             X)
+from plant_sim.state import (
+    N_STATE,
+    ROW_SLOPE,
+    ROW_SPEED,
+    ROW_THETA_R,
+    ROW_THETA_W,
+    ROW_TORQUE,
+    ROW_V,
+    ROW_V_REF,
+    ROW_X,
+    X,
+)
 
 TICKS_PER_SAMPLE = 10
 NO_RULE = (0.0, 0.0)
@@ -32,8 +42,8 @@ class PlantSample:
     Attributes
     ----------
     torque_nm, speed_rpm, v_ref_mps, slope_rad
-        What acted over the step that ENDED at this tick. The mean over ticks 10j+1 .. 10j+10 is therefore the input of
-        the 0.1-s interval j.
+        What acted over the step that ENDED at this tick. The mean over ticks 10j+1 .. 10j+10 is therefore
+        the input of the 0.1-s interval j.
     v_mps, x_m, theta_w_degc, theta_r_degc
         State at this tick (truth).
     done
@@ -67,15 +77,22 @@ class Plant:
     cycle
         What to drive: a specification or a built cycle.
     theta0_degc
-        Start temperature of all nodes, or one value per node (70,); None takes the specification's (60 for a built cycle).
+        Start temperature of all nodes, or one value per node (70,); None takes the specification's (60 for a
+        built cycle).
     seed
         Seed of the sensor noise.
     engine
         ``numba`` (compiled) or ``numpy`` (the readable reference); both give the same run within rounding.
     """
 
-    def __init__(self, params: PlantParams, cycle: CycleSpec | Cycle, theta0_degc: float | NDArray[np.float64] | None = None,
-                 seed: int = 0, engine: Engine = "numba") -> None:
+    def __init__(
+        self,
+        params: PlantParams,
+        cycle: CycleSpec | Cycle,
+        theta0_degc: float | NDArray[np.float64] | None = None,
+        seed: int = 0,
+        engine: Engine = "numba",
+    ) -> None:
         if theta0_degc is None:
             theta0_degc = cycle.theta0_degc if isinstance(cycle, CycleSpec) else 60.0
         self.params = params
@@ -127,12 +144,23 @@ class Plant:
         row, measured = self._advance(1, derate, NO_RULE, False)
         r = row[0]
         meas = measured[0] if measured.size else (None, None)
-        return PlantSample(self._tick, self._tick * DT_S, float(r[ROW_TORQUE]), float(r[ROW_SPEED]), float(r[ROW_V]),
-                           float(r[ROW_X]), float(r[ROW_V_REF]), float(r[ROW_SLOPE]), float(r[ROW_THETA_W]),
-                           float(r[ROW_THETA_R]), self.done, *(None if m is None else float(m) for m in meas))
+        return PlantSample(
+            self._tick,
+            self._tick * DT_S,
+            float(r[ROW_TORQUE]),
+            float(r[ROW_SPEED]),
+            float(r[ROW_V]),
+            float(r[ROW_X]),
+            float(r[ROW_V_REF]),
+            float(r[ROW_SLOPE]),
+            float(r[ROW_THETA_W]),
+            float(r[ROW_THETA_R]),
+            self.done,
+            *(None if m is None else float(m) for m in meas),
+        )
 
     def advance(self, seconds: float, derate: float = 1.0) -> None:
-        """Advance many steps at once; leaves exactly the state that stepping would, sensor history and noise included."""
+        """Advance many steps at once; leaves the state that stepping would, sensor history and noise too."""
         ticks = round(seconds / DT_S)
         if ticks < 0 or abs(ticks * DT_S - seconds) > 1e-6:
             raise PlantStateError(f"cannot advance by {seconds} s: give a non-negative multiple of {DT_S} s")
@@ -141,19 +169,23 @@ class Plant:
             self._advance(chunk, derate, NO_RULE, False)
             ticks -= chunk
 
-    def record(self, ticks: int, derate: float = 1.0, rule_degc: tuple[float, float] = NO_RULE, stop: bool = True
-               ) -> NDArray[np.float64]:
-        """Advance up to ``ticks`` steps (to the cycle's end if ``stop``) and return their rows (n, 8), see `state`."""
+    def record(
+        self, ticks: int, derate: float = 1.0, rule_degc: tuple[float, float] = NO_RULE, stop: bool = True
+    ) -> NDArray[np.float64]:
+        """Advance up to ``ticks`` steps (``stop``: to the cycle's end); return their rows (n, 8)."""
         return self._advance(ticks, derate, rule_degc, stop)[0]
 
-    def _advance(self, ticks: int, derate: float, rule: tuple[float, float], stop: bool
-                 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _advance(
+        self, ticks: int, derate: float, rule: tuple[float, float], stop: bool
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if not 0.0 <= derate <= 1.0:
             raise PlantStateError(f"derating factor {derate} is outside 0..1")
-        rows = self._engine.run(ticks, self._tick, self._state, self._theta, self._boundary, derate, rule, stop)
+        rows = self._engine.run(
+            ticks, self._tick, self._state, self._theta, self._boundary, derate, rule, stop
+        )
         first = -(self._tick + 1) % TICKS_PER_SAMPLE
         self._tick += rows.shape[0]
-        return rows, self._sensor.sample(rows[first::TICKS_PER_SAMPLE, ROW_THETA_W:ROW_THETA_R + 1])
+        return rows, self._sensor.sample(rows[first::TICKS_PER_SAMPLE, ROW_THETA_W : ROW_THETA_R + 1])
 
     def _theta_pair(self) -> NDArray[np.float64]:
         t = self._theta

@@ -37,9 +37,17 @@ class ReferenceEngine:
         self._losses = LossModel(params, build_network(params), build_dq_map(params.machine))
         self._lag = exp(-DT_S / params.machine.torque_lag_s)
 
-    def run(self, ticks: int, tick: int, state: NDArray[np.float64], theta: NDArray[np.float64],
-            boundary: NDArray[np.float64], derate: float, rule: tuple[float, float], stop: bool
-            ) -> NDArray[np.float64]:
+    def run(
+        self,
+        ticks: int,
+        tick: int,
+        state: NDArray[np.float64],
+        theta: NDArray[np.float64],
+        boundary: NDArray[np.float64],
+        derate: float,
+        rule: tuple[float, float],
+        stop: bool,
+    ) -> NDArray[np.float64]:
         """Advance ``state`` (5,) and ``theta`` (70,) in place; return one row (8) per tick done.
 
         Parameters
@@ -51,19 +59,28 @@ class ReferenceEngine:
         derate
             Fixed derating factor; multiplied with that of the rule.
         rule
-            Linear derating on the true winding temperature (start, end) in degC; end <= start switches it off.
+            Linear derating on the true winding temperature (start, end) in degC; end <= start switches it
+            off.
         stop
             Return early when the cycle's end is reached.
         """
         rows = np.empty((ticks, N_ROW))
         for k in range(ticks):
-            rows[k] = self._step(tick + k, state, theta, boundary, derate * linear_derate(theta[THETA_W], rule))
+            rows[k] = self._step(
+                tick + k, state, theta, boundary, derate * linear_derate(theta[THETA_W], rule)
+            )
             if stop and self._cycle.done((tick + k + 1) * DT_S, state[X]):
                 return rows[: k + 1]
         return rows
 
-    def _step(self, tick: int, s: NDArray[np.float64], theta: NDArray[np.float64], boundary: NDArray[np.float64],
-              derate: float) -> tuple[float, ...]:
+    def _step(
+        self,
+        tick: int,
+        s: NDArray[np.float64],
+        theta: NDArray[np.float64],
+        boundary: NDArray[np.float64],
+        derate: float,
+    ) -> tuple[float, ...]:
         p, cycle = self._params, self._cycle
         v_ref, slope = cycle.reference(tick * DT_S, s[X], p.driver.lookahead_m)
         if cycle.servo is not None:

@@ -12,7 +12,16 @@ from plant_sim.errors import PlantStateError
 from plant_sim.lptn import DT_S
 from plant_sim.params import PlantParams
 from plant_sim.plant import NO_RULE, Engine, Plant
-from plant_sim.state import ROW_SLOPE, ROW_SPEED, ROW_THETA_R, ROW_THETA_W, ROW_TORQUE, ROW_V, ROW_V_REF, ROW_X
+from plant_sim.state import (
+    ROW_SLOPE,
+    ROW_SPEED,
+    ROW_THETA_R,
+    ROW_THETA_W,
+    ROW_TORQUE,
+    ROW_V,
+    ROW_V_REF,
+    ROW_X,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +57,17 @@ class Run:
     finished_s: float | None
 
 
-def simulate(params: PlantParams, cycle: CycleSpec | Cycle, duration_s: float | None = None, *,
-             theta0_degc: float | NDArray[np.float64] | None = None, rule_degc: tuple[float, float] = NO_RULE,
-             rate_hz: int = 10, engine: Engine = "numba", max_s: float = 7200.0) -> Run:
+def simulate(
+    params: PlantParams,
+    cycle: CycleSpec | Cycle,
+    duration_s: float | None = None,
+    *,
+    theta0_degc: float | NDArray[np.float64] | None = None,
+    rule_degc: tuple[float, float] = NO_RULE,
+    rate_hz: int = 10,
+    engine: Engine = "numba",
+    max_s: float = 7200.0,
+) -> Run:
     """Drive a cycle without sensors and return it as arrays.
 
     Parameters
@@ -74,13 +91,25 @@ def simulate(params: PlantParams, cycle: CycleSpec | Cycle, duration_s: float | 
     rows = np.concatenate([first, plant.record(ticks, rule_degc=rule_degc)])
     per = round(1.0 / DT_S) // rate_hz
     count = (rows.shape[0] - 1) // per
-    mean = rows[1:1 + count * per].reshape(count, per, 8).mean(axis=1)
-    at = rows[: count * per + 1: per]
+    mean = rows[1 : 1 + count * per].reshape(count, per, 8).mean(axis=1)
+    at = rows[: count * per + 1 : per]
     period = per * DT_S
     rate = np.diff(at[:, [ROW_THETA_W, ROW_THETA_R]], axis=0) / period
-    return Run(np.arange(count) * period, mean[:, ROW_SPEED], mean[:, ROW_TORQUE], at[:-1, ROW_THETA_W], at[:-1, ROW_THETA_R],
-               rate[:, 0], rate[:, 1], at[:-1, ROW_V], at[:-1, ROW_X], mean[:, ROW_V_REF], mean[:, ROW_SLOPE],
-               plant.theta_degc, plant.tick * DT_S if plant.done else None)
+    return Run(
+        np.arange(count) * period,
+        mean[:, ROW_SPEED],
+        mean[:, ROW_TORQUE],
+        at[:-1, ROW_THETA_W],
+        at[:-1, ROW_THETA_R],
+        rate[:, 0],
+        rate[:, 1],
+        at[:-1, ROW_V],
+        at[:-1, ROW_X],
+        mean[:, ROW_V_REF],
+        mean[:, ROW_SLOPE],
+        plant.theta_degc,
+        plant.tick * DT_S if plant.done else None,
+    )
 
 
 def _theta_pair(theta: NDArray[np.float64]) -> tuple[float, float]:

@@ -19,14 +19,41 @@ START_MPS = 3.0
 LAP_SEED = 3
 _GRADE_MIN, _GRADE_MAX = -0.13, 0.18
 
-# Our own elevation profile (km, m). Public facts held: 20.832 km, lowest 320 m near km 11, highest 616.8 m in the eastern
-# climb, start and finish on the southern plateau. Everything between is authored.
+# Our own elevation profile (km, m). Public facts held: 20.832 km, lowest 320 m near km 11, highest 616.8 m in
+# the eastern climb, start and finish on the southern plateau. Everything between is authored.
 LAP_ANCHORS_KM_M = (
-    (0.00, 612.0), (0.60, 606.0), (1.25, 588.0), (1.90, 566.0), (2.45, 548.0), (3.05, 561.0), (3.70, 583.0), (4.35, 590.0),
-    (5.00, 566.0), (5.60, 532.0), (6.15, 487.0), (6.65, 439.0), (7.05, 447.0), (7.60, 468.0), (8.20, 457.0), (8.85, 428.0),
-    (9.50, 398.0), (10.10, 356.0), (10.60, 330.0), (11.00, 320.0), (11.50, 342.0), (12.15, 381.0), (12.80, 436.0),
-    (13.45, 497.0), (14.10, 561.0), (14.75, 616.8), (15.50, 585.0), (16.20, 557.0), (17.05, 570.0), (18.10, 584.0),
-    (19.10, 574.0), (20.15, 603.0),
+    (0.00, 612.0),
+    (0.60, 606.0),
+    (1.25, 588.0),
+    (1.90, 566.0),
+    (2.45, 548.0),
+    (3.05, 561.0),
+    (3.70, 583.0),
+    (4.35, 590.0),
+    (5.00, 566.0),
+    (5.60, 532.0),
+    (6.15, 487.0),
+    (6.65, 439.0),
+    (7.05, 447.0),
+    (7.60, 468.0),
+    (8.20, 457.0),
+    (8.85, 428.0),
+    (9.50, 398.0),
+    (10.10, 356.0),
+    (10.60, 330.0),
+    (11.00, 320.0),
+    (11.50, 342.0),
+    (12.15, 381.0),
+    (12.80, 436.0),
+    (13.45, 497.0),
+    (14.10, 561.0),
+    (14.75, 616.8),
+    (15.50, 585.0),
+    (16.20, 557.0),
+    (17.05, 570.0),
+    (18.10, 584.0),
+    (19.10, 574.0),
+    (20.15, 603.0),
 )
 _STRAIGHT_M = (18250.0, 20150.0)
 
@@ -42,15 +69,20 @@ def synthetic_lap(params: PlantParams, a_lat_mps2: float = 6.5) -> Cycle:
 def lap_grade() -> NDArray[np.float64]:
     """Grade (rise over run) of the lap at each metre, periodic."""
     anchors = np.array(LAP_ANCHORS_KM_M)
-    shift = LAP_LENGTH_M / 1000.0
-    wrapped = np.vstack([anchors - [shift, 0.0], anchors, anchors + [shift, 0.0]])
+    lap = np.array([LAP_LENGTH_M / 1000.0, 0.0])
+    wrapped = np.vstack([anchors - lap, anchors, anchors + lap])
     s = np.arange(-500.0, LAP_LENGTH_M + 500.5, STEP_M)
     height = gaussian_smooth(pchip(wrapped[:, 0] * 1000.0, wrapped[:, 1], s), 40.0 / STEP_M)
     return np.clip(np.gradient(height, STEP_M), _GRADE_MIN, _GRADE_MAX)[500:-500]
 
 
-def random_track(params: PlantParams, rng: np.random.Generator, length_m: float = 23000.0, speed_factor: float = 1.0,
-                 name: str = "track") -> Cycle:
+def random_track(
+    params: PlantParams,
+    rng: np.random.Generator,
+    length_m: float = 23000.0,
+    speed_factor: float = 1.0,
+    name: str = "track",
+) -> Cycle:
     """Return a random mountain track for training: corners and hills like the lap's, never the lap itself.
 
     Parameters
@@ -77,9 +109,10 @@ def random_track(params: PlantParams, rng: np.random.Generator, length_m: float 
     return Cycle(name, True, STEP_M, np.maximum(v_ref * speed_factor, START_MPS), slope)
 
 
-def corner_curvature(rng: np.random.Generator, length_m: float, corners: int, straight_m: tuple[float, float]
-                     ) -> NDArray[np.float64]:
-    """Curvature in 1/m at each metre: corners with log-normal radii (median 105 m, sigma 0.70), one long straight.
+def corner_curvature(
+    rng: np.random.Generator, length_m: float, corners: int, straight_m: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Curvature in 1/m at each metre: corners with log-normal radii (105 m, sigma 0.70), one long straight.
 
     40 of 73 corners turn right (negative), the rest left; the speed profile uses the magnitude only.
     """
@@ -103,13 +136,19 @@ def corner_curvature(rng: np.random.Generator, length_m: float, corners: int, st
             begin, end = begin + straight_m[1] - straight_m[0], at + straight_m[1] - straight_m[0]
         else:
             end = min(at, straight_m[0])
-        curvature[int(begin / STEP_M):int(end / STEP_M) + 1] = sign[k] / radius[k]
+        curvature[int(begin / STEP_M) : int(end / STEP_M) + 1] = sign[k] / radius[k]
     return gaussian_smooth(curvature, 8.0 / STEP_M)
 
 
-def speed_profile(curvature_1pm: NDArray[np.float64], slope_rad: NDArray[np.float64], step_m: float, a_lat_mps2: float,
-                  params: PlantParams) -> NDArray[np.float64]:
-    """Quasi-steady full-power speed profile: cornering limit, forward pass with the envelope, backward pass with brakes.
+def speed_profile(
+    curvature_1pm: NDArray[np.float64],
+    slope_rad: NDArray[np.float64],
+    step_m: float,
+    a_lat_mps2: float,
+    params: PlantParams,
+) -> NDArray[np.float64]:
+    """Quasi-steady full-power speed profile: cornering limit, forward pass on the envelope, backward on
+    brakes.
 
     Returns
     -------

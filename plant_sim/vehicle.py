@@ -25,8 +25,9 @@ def acceleration_mps2(v_mps: float, torque_nm: float, slope_rad: float, p: Vehic
     return force / p.mass_kg
 
 
-def vehicle_step(x_m: float, v_mps: float, torque_nm: float, slope_rad: float, dt_s: float, p: VehicleParams
-                 ) -> tuple[float, float]:
+def vehicle_step(
+    x_m: float, v_mps: float, torque_nm: float, slope_rad: float, dt_s: float, p: VehicleParams
+) -> tuple[float, float]:
     """Advance position and speed by one explicit Euler step; the car never rolls backwards."""
     v_next = v_mps + dt_s * acceleration_mps2(v_mps, torque_nm, slope_rad, p)
     return x_m + dt_s * v_mps, max(v_next, 0.0)
@@ -41,6 +42,10 @@ def motoring_limit_nm(speed_rpm: float, p: MachineParams) -> float:
 def regen_limit_nm(speed_rpm: float, v_mps: float, p: MachineParams) -> float:
     """Largest braking torque (positive number); fades out between 12 and 5 km/h."""
     omega = abs(speed_rpm) * pi / 30.0
-    limit = p.regen_torque_max_nm if omega * p.regen_torque_max_nm <= p.regen_power_max_w else p.regen_power_max_w / omega
+    limit = (
+        p.regen_torque_max_nm
+        if omega * p.regen_torque_max_nm <= p.regen_power_max_w
+        else p.regen_power_max_w / omega
+    )
     fade = (v_mps - p.regen_v_lo_mps) / (p.regen_v_hi_mps - p.regen_v_lo_mps)
     return limit * min(max(fade, 0.0), 1.0)

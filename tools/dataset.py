@@ -1,7 +1,8 @@
 """Build training data from the plant: data set R (recommended), P (paper protocol), and the test lap.
 
-``python -m tools.dataset --set R --seed 1 --out build/data/R.npz`` writes the set; the lap goes beside it as ``lap.npz``.
-Rows are 10-Hz intervals: mean speed and torque over the interval, temperatures at its start, forward-difference rates.
+``python -m tools.dataset --set R --seed 1 --out build/data/R.npz`` writes the set; the lap goes beside it as
+``lap.npz``. Rows are 10-Hz intervals: mean speed and torque over the interval, temperatures at its start,
+forward-difference rates.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,17 +63,20 @@ class DataSet:
         """One column by name."""
         return self.values[:, COLUMNS.index(name)]
 
-    def arrays(self) -> dict[str, NDArray]:
+    def arrays(self) -> dict[str, Any]:
         """Everything that the file holds; ``t_s`` counts from the start of each trajectory."""
         changes = np.flatnonzero(np.diff(self.trajectory, prepend=-1))
         start = np.repeat(changes, np.diff(np.append(changes, self.trajectory.size)))
-        out: dict[str, NDArray] = {name: self.column(name).copy() for name in COLUMNS}
-        return out | {"t_s": (np.arange(self.trajectory.size) - start) * 0.1, "trajectory": self.trajectory,
-                      "sha256": np.array(self.sha256)}
+        out: dict[str, Any] = {name: self.column(name).copy() for name in COLUMNS}
+        return out | {
+            "t_s": (np.arange(self.trajectory.size) - start) * 0.1,
+            "trajectory": self.trajectory,
+            "sha256": np.array(self.sha256),
+        }
 
 
 def customised_cycle(rng: np.random.Generator, rotate: bool, base_seed: int) -> Cycle:
-    """Return a class-3-like cycle, faster per phase, on a road whose grade keeps the winding at drawn temperatures.
+    """Return a faster class-3-like cycle on a road whose grade keeps the winding at drawn temperatures.
 
     Parameters
     ----------
@@ -81,7 +86,7 @@ def customised_cycle(rng: np.random.Generator, rotate: bool, base_seed: int) -> 
         Which variant of the class-3 generator to bend.
     """
     trace, borders = class3_trace(base_seed)
-    phases = [trace[borders[i] + 1: borders[i + 1] + 1] * rng.uniform(*_SPEED_FACTORS[i]) for i in range(4)]
+    phases = [trace[borders[i] + 1 : borders[i + 1] + 1] * rng.uniform(*_SPEED_FACTORS[i]) for i in range(4)]
     v = np.concatenate([[0.0], *([phases[3], *phases[:3]] if rotate else phases)])
     v = np.minimum(v, 130.0 / 3.6)
     target, dither = np.empty(CYCLE_S + 1), np.empty(CYCLE_S + 1)
@@ -96,7 +101,9 @@ def customised_cycle(rng: np.random.Generator, rotate: bool, base_seed: int) -> 
 
 def _draw_target(rng: np.random.Generator) -> float:
     """Winding target in degC; mostly the derating region, where accuracy matters."""
-    low, high = ((152.0, 160.0), (125.0, 152.0), (85.0, 125.0), (160.0, 170.0))[rng.choice(4, p=(0.72, 0.14, 0.08, 0.06))]
+    low, high = ((152.0, 160.0), (125.0, 152.0), (85.0, 125.0), (160.0, 170.0))[
+        rng.choice(4, p=(0.72, 0.14, 0.08, 0.06))
+    ]
     return rng.uniform(low, high)
 
 
@@ -105,7 +112,7 @@ def _draw_dither(rng: np.random.Generator) -> float:
 
 
 def road_runs(params: PlantParams, recipe: Recipe, seed: int) -> Iterator[Run]:
-    """Drive the customised cycles one after the other; only the cold ones restart from a uniform temperature."""
+    """Drive the customised cycles in a row; only the cold ones restart from a uniform temperature."""
     rng = np.random.default_rng([seed, 1])
     theta: float | NDArray[np.float64] = 60.0
     for k in range(recipe.cycles):
@@ -114,7 +121,9 @@ def road_runs(params: PlantParams, recipe: Recipe, seed: int) -> Iterator[Run]:
             theta = float(rng.choice([40.0, 60.0]))
         mass = float(rng.choice(_MASSES_KG))
         heavy = params.varied(vehicle__mass_kg=params.vehicle.mass_kg + mass)
-        run = simulate(heavy, customised_cycle(rng, cold, base_seed=100 * seed + k), CYCLE_S, theta0_degc=theta)
+        run = simulate(
+            heavy, customised_cycle(rng, cold, base_seed=100 * seed + k), CYCLE_S, theta0_degc=theta
+        )
         theta = run.theta_end_degc
         yield run
 
@@ -122,7 +131,8 @@ def road_runs(params: PlantParams, recipe: Recipe, seed: int) -> Iterator[Run]:
 def track_runs(params: PlantParams, recipe: Recipe, seed: int) -> Iterator[Run]:
     """Drive random mountain laps, cut to equal length.
 
-    Every third lap is calmer, every second one derated linearly from 150 degC, every fourth starts anew at U(25, 70) degC.
+    Every third lap is calmer, every second one derated linearly from 150 degC, every fourth starts anew at
+    U(25, 70) degC.
     """
     rng = np.random.default_rng([seed, 2])
     theta: float | NDArray[np.float64] = 60.0
@@ -147,16 +157,23 @@ def build_set(params: PlantParams, name: str, seed: int, progress=lambda text: N
     """
     recipe = RECIPES[name]
     blocks, labels = [], []
-    for runs, length_s in ((road_runs(params, recipe, seed), CYCLE_S), (track_runs(params, recipe, seed), LAP_S)):
+    for runs, length_s in (
+        (road_runs(params, recipe, seed), CYCLE_S),
+        (track_runs(params, recipe, seed), LAP_S),
+    ):
         for run in runs:
             block = rows_of(run)
             if block.shape[0] != length_s * 10 or not np.isfinite(block).all():
-                raise PlantError(f"data set {name}, trajectory {len(blocks)}: {block.shape[0]} rows instead of "
-                                 f"{length_s * 10}, or not finite; change the seed and report the defect")
+                raise PlantError(
+                    f"data set {name}, trajectory {len(blocks)}: {block.shape[0]} rows instead of "
+                    f"{length_s * 10}, or not finite; change the seed and report the defect"
+                )
             labels.append(np.full(block.shape[0], len(blocks), dtype=np.int32))
             blocks.append(block)
-            progress(f"{name}: trajectory {len(blocks)}/{recipe.cycles + recipe.laps}, {block.shape[0]} rows, winding "
-                     f"{block[:, 2].min():.0f}..{block[:, 2].max():.0f} degC")
+            progress(
+                f"{name}: trajectory {len(blocks)}/{recipe.cycles + recipe.laps}, {block.shape[0]} rows, "
+                f"winding {block[:, 2].min():.0f}..{block[:, 2].max():.0f} degC"
+            )
     return DataSet(np.concatenate(blocks), np.concatenate(labels))
 
 
@@ -189,7 +206,9 @@ def write_npz(path: Path, data: DataSet) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Command line entry."""
     parser = argparse.ArgumentParser(description="Build a training data set and the test lap from the plant.")
-    parser.add_argument("--set", choices=sorted(RECIPES), default="R", help="R: cycles and tracks; P: cycles only")
+    parser.add_argument(
+        "--set", choices=sorted(RECIPES), default="R", help="R: cycles and tracks; P: cycles only"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="file to write; lap.npz goes beside it")
     args = parser.parse_args(argv)
@@ -202,9 +221,15 @@ def main(argv: list[str] | None = None) -> int:
     except (PlantError, OSError) as error:
         print(f"dataset: {error}", file=sys.stderr)
         return 1
-    print(f"{args.out}: {data.values.shape[0]} rows, {hot_share(data):.1%} at 150..160 degC, sha256 {data.sha256}")
-    print(f"{args.out.with_name('lap.npz')}: {lap.values.shape[0]} rows, winding max {lap.column('theta_w_degc').max():.1f} "
-          f"degC, sha256 {lap.sha256}")
+    print(
+        f"{args.out}: {data.values.shape[0]} rows, {hot_share(data):.1%} at 150..160 degC, "
+        f"sha256 {data.sha256}"
+    )
+    print(
+        f"{args.out.with_name('lap.npz')}: {lap.values.shape[0]} rows, "
+        f"winding max {lap.column('theta_w_degc').max():.1f} "
+        f"degC, sha256 {lap.sha256}"
+    )
     return 0
 
 
