@@ -1,0 +1,161 @@
+"""What is in a log, in figures: counts, rates, gaps, damage. Text is made of it elsewhere."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rt_runner.e2e import COUNTER_MASK, E2eStatus
+from rt_runner.log_reader import LogReader
+
+RATE_TOLERANCE = 0.05  # a mean period further off its cycle than this is pointed out
+MIN_PERIODS = 5  # ... once there are this many periods to judge
+
+
+@dataclass
+class MessageSummary:
+    """One message of the DBC over a whole log. Times in ms; None where there are too few frames."""
+
+    name: str
+    can_id: str
+    sender: str
+    cycle_ms: float  # of the DBC; for frames sent per job the period of the loop, where the log says it
+    per_job: bool
+    simulation_only: bool
+    frames: int = 0
+    mean_ms: float | None = None
+    min_ms: float | None = None
+    max_ms: float | None = None
+    counter_gaps: int = 0  # places where the counter jumped
+    lost: int = 0  # frames missing there, modulo 16
+    repeated: int = 0
+    wrong_sequence: int = 0
+    wrong_crc: int = 0
+
+    @property
+    def rate_ok(self) -> bool | None:
+        """Whether the mean period is that of the DBC; None where it cannot be judged."""
+        if self.mean_ms is None or self.frames <= MIN_PERIODS:
+            return None
+        return abs(self.mean_ms - self.cycle_ms) <= RATE_TOLERANCE * self.cycle_ms
+
+
+@dataclass
+class LogSummary:
+    """A whole log."""
+
+    path: str
+    bytes: int
+    complete: bool
+    trouble: list[str]
+    frames: int = 0
+    unknown: dict[str, int] = field(default_factory=dict)  # ids that are not in the DBC, with their counts
+    start_ns: int | None = None
+    end_ns: int | None = None
+    messages: list[MessageSummary] = field(default_factory=list)
+    attachments: dict[str, int] = field(default_factory=dict)  # name -> bytes
+    run: dict[str, str] = field(default_factory=dict)
+    result: dict[str, Any] | None = None
+
+    @property
+    def duration_s(self) -> float:
+        """From the first frame to the last."""
+        return 0.0 if self.start_ns is None or self.end_ns is None else (self.end_ns - self.start_ns) / 1e9
+
+
+@dataclass
+class _Running:
+    """Figures of one message while its frames pass by."""
+
+    summary: MessageSummary
+    first_ns: int = 0
+    last_ns: int = 0
+    counter: int | None = None
+
+    def add(self, t_ns: int, counter: float | None, e2e: int) -> None:
+        s = self.summary
+        if s.frames:
+            gap_ms = (t_ns - self.last_ns) / 1e6
+            s.min_ms = gap_ms if s.min_ms is None else min(s.min_ms, gap_ms)
+            s.max_ms = gap_ms if s.max_ms is None else max(s.max_ms, gap_ms)
+            s.mean_ms = (t_ns - self.first_ns) / 1e6 / s.frames
+        else:
+            self.first_ns = t_ns
+        s.frames += 1
+        self.last_ns = t_ns
+        s.repeated += e2e == E2eStatus.REPEATED
+        s.wrong_sequence += e2e == E2eStatus.WRONG_SEQUENCE
+        s.wrong_crc += e2e == E2eStatus.WRONG_CRC
+        if counter is None:
+            return
+        if self.counter is not None and e2e != E2eStatus.REPEATED:
+            missing = (int(counter) - self.counter - 1) & COUNTER_MASK
+            s.lost += missing
+            s.counter_gaps += missing > 0
+        self.counter = int(counter)
+
+
+def summarise(path: str | Path) -> LogSummary:
+    """Read a log, finished or not, and say what is in it.
+
+    Raises
+    ------
+    LogError : no such file, or not an MCAP file (one line)
+    """
+    reader = LogReader(path)
+    running = {name: _Running(m) for name, m in _messages(reader).items()}
+    summary = LogSummary(str(path), reader.size, reader.complete, reader.trouble)
+    for frame in reader.frames():
+        one = running.get(frame.name)
+        if one is not None:
+            one.add(frame.t_ns, frame.values.get("counter"), frame.e2e)
+    known = {int(r.summary.can_id, 16) for r in running.values()}
+    for raw in reader.raw():
+        summary.frames += 1
+        summary.start_ns = raw.t_ns if summary.start_ns is None else min(summary.start_ns, raw.t_ns)
+        summary.end_ns = raw.t_ns if summary.end_ns is None else max(summary.end_ns, raw.t_ns)
+        if raw.can_id not in known:
+            key = f"0x{raw.can_id:03X}"
+            summary.unknown[key] = summary.unknown.get(key, 0) + 1
+    summary.messages = [r.summary for r in running.values()]
+    summary.attachments = {name: len(data) for name, data in reader.attachments.items()}
+    summary.run = reader.metadata.get("run", {})
+    summary.result = result_of(reader.metadata)
+    return summary
+
+
+def result_of(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, Any] | None:
+    """The result as the run wrote it, None if it did not get that far."""
+    try:
+        result = json.loads(metadata["result"]["json"])
+    except (KeyError, ValueError):
+        return None
+    return result if isinstance(result, dict) else None
+
+
+def _messages(reader: LogReader) -> dict[str, MessageSummary]:
+    """One entry per channel of decoded frames, as the log itself describes it; no DBC is needed."""
+    period_ms = _float(reader.metadata.get("run", {}).get("period_s"))
+    out = {}
+    for name, about in reader.channels().items():
+        per_job = about.get("per_job") == "1"
+        cycle_ms = _float(about.get("cycle_ms")) or 0.0
+        if per_job and period_ms:
+            cycle_ms = 1e3 * period_ms
+        out[name] = MessageSummary(
+            name=name,
+            can_id=about.get("can_id", "0x0"),
+            sender=about.get("sender", ""),
+            cycle_ms=cycle_ms,
+            per_job=per_job,
+            simulation_only=about.get("simulation_only") == "1",
+        )
+    return out
+
+
+def _float(text: str | None) -> float | None:
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return None
