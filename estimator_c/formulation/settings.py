@@ -1,0 +1,118 @@
+"""Estimator settings: TOML files -> one constant table in C. The schema lives here, the values in settings/*.toml."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .errors import FormulationError
+
+REMEDY = "see estimator_c/settings/default.toml for every field and its meaning"
+PER_CHANNEL = "pair"
+
+
+@dataclass(frozen=True)
+class Field:
+    """One setting: TOML table and key, C name and type, allowed range (inclusive), one line of meaning."""
+
+    table: str
+    key: str
+    c_name: str
+    kind: str  # "int" | "float" | "bool" | "pair" (one value per channel: winding, rotor)
+    low: float
+    high: float
+    meaning: str
+
+
+FIELDS = (
+    Field("sensor", "delay_steps", "delay_steps", "int", 0, 50, "sensor delay in intervals of 0.1 s"),
+    Field("sensor", "offset_degc", "offset_degc", "float", -50, 50, "known sensor offset, subtracted"),
+    Field("sensor", "timeout_s", "sensor_timeout_s", "float", 0.1, 60,
+          "status 'predicting' after this long without a measurement"),
+    Field("weights", "measurement", "weight_measurement", PER_CHANNEL, 0, 1e6, "Wy, 1/K^2"),
+    Field("weights", "noise", "weight_noise", PER_CHANNEL, 1e-6, 1e9, "Ww, 1/K^2 per interval"),
+    Field("weights", "arrival", "weight_arrival", PER_CHANNEL, 1e-9, 1e9, "P0 once the window is full, 1/K^2"),
+    Field("weights", "prior", "weight_prior", PER_CHANNEL, 1e-9, 1e9, "P0 while the window grows, 1/K^2"),
+    Field("weights", "newest_measurement", "newest_measurement", "bool", 0, 1,
+          "the newest node carries a measurement residual"),
+    Field("bounds", "hard", "hard_bounds", "bool", 0, 1, "bounds are a hard box, else a quadratic penalty"),
+    Field("bounds", "lower_degc", "lower_degc", "float", -273.15, 1000, "lower bound on both temperatures"),
+    Field("bounds", "upper_degc", "upper_degc", "float", -273.15, 1000, "upper bound on both temperatures"),
+    Field("bounds", "weight", "bound_weight", "float", 0, 1e9, "penalty of soft bounds, 1/K^2 per node"),
+    Field("solver", "max_sweeps", "max_sweeps", "int", 1, 100, "most gradient sweeps per step"),
+    Field("solver", "tolerance_degc", "tolerance_degc", "float", 0, 1, "stop when the next change is below this"),
+    Field("start", "spin_up_steps", "spin_up_steps", "int", 0, 2000,
+          "steps of the net with the first input before the first node"),
+    Field("start", "max_gap_steps", "max_gap_steps", "int", 1, 60,
+          "intervals without motor frames bridged by holding; more restarts"),
+)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One validated settings file; values are keyed by C name (int, float, bool or a pair of floats)."""
+
+    name: str
+    title: str
+    id: int
+    values: dict[str, Any]
+
+
+def load_settings(folder: str | Path) -> list[Setting]:
+    """All *.toml of a folder, ordered by id. Raises FormulationError with file, field and what to do."""
+    paths = sorted(Path(folder).glob("*.toml"))
+    if not paths:
+        raise FormulationError(folder, "folder", "holds no *.toml settings", "give the folder with default.toml")
+    settings = sorted((_load(path) for path in paths), key=lambda setting: setting.id)
+    ids = [setting.id for setting in settings]
+    if len(set(ids)) != len(ids):
+        raise FormulationError(folder, "id", f"is used twice ({ids})", "give every settings file its own id")
+    return settings
+
+
+def _load(path: Path) -> Setting:
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
+        raise FormulationError(path, "file", f"cannot be read ({err})", REMEDY) from err
+    title, number = data.pop("title", ""), data.pop("id", None)
+    if not isinstance(title, str):
+        raise FormulationError(path, "title", "must be text", REMEDY)
+    if type(number) is not int or not 0 <= number <= 254:
+        raise FormulationError(path, "id", f"must be a whole number 0..254, is {number!r}", REMEDY)
+    known = {(field.table, field.key) for field in FIELDS}
+    for table, content in data.items():
+        if not isinstance(content, dict):
+            raise FormulationError(path, table, "is not a known field", REMEDY)
+        for key in content:
+            if (table, key) not in known:
+                raise FormulationError(path, f"{table}.{key}", "is not a known field", REMEDY)
+    values = {field.c_name: _value(path, field, data) for field in FIELDS}
+    if values["lower_degc"] >= values["upper_degc"]:
+        raise FormulationError(path, "bounds", "lower_degc must lie below upper_degc", REMEDY)
+    return Setting(path.stem, title, number, values)
+
+
+def _value(path: Path, field: Field, data: dict[str, Any]) -> Any:
+    where = f"{field.table}.{field.key}"
+    if field.key not in data.get(field.table, {}):
+        raise FormulationError(path, where, "is missing", REMEDY)
+    found = data[field.table][field.key]
+    if field.kind == "bool":
+        if type(found) is not bool:
+            raise FormulationError(path, where, f"must be true or false, is {found!r}", REMEDY)
+        return found
+    items = found if field.kind == PER_CHANNEL else [found]
+    if field.kind == PER_CHANNEL and (not isinstance(found, list) or len(found) != 2):
+        raise FormulationError(path, where, f"must be [winding, rotor], is {found!r}", REMEDY)
+    for item in items:
+        right_type = type(item) is int or (type(item) is float and field.kind != "int")
+        if not right_type or not math.isfinite(item) or not field.low <= item <= field.high:
+            kind = "a whole number" if field.kind == "int" else "a number"
+            raise FormulationError(path, where, f"must be {kind} in {field.low:g}..{field.high:g}, is {item!r}", REMEDY)
+    if field.kind == PER_CHANNEL:
+        return tuple(float(item) for item in items)
+    return int(found) if field.kind == "int" else float(found)

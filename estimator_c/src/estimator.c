@@ -1,0 +1,375 @@
+#include "estimator.h"
+
+#include <math.h>
+#include <string.h>
+
+#define RING_MASK (ESTIMATOR_RING - 1)
+#define OFF_GRID_LIMIT 10 /* that many temperature frames off the grid in a row mean the plant moved its grid */
+
+static size_t slot(int64_t k)
+{
+    return (size_t)(k & RING_MASK);
+}
+
+/* Everything but the setting and the counters back to the beginning. */
+static void forget(estimator_t *self)
+{
+    const est_setting_t setting = self->setting;
+    const estimator_counters_t counters = self->counters;
+    const bool invalid_pending = self->invalid_pending;
+    memset(self, 0, sizeof *self);
+    self->setting = setting;
+    self->counters = counters;
+    self->invalid_pending = invalid_pending;
+    mhe_init(&self->mhe, &self->setting);
+    for (int k = 0; k < ESTIMATOR_RING; k++) {
+        self->measured[k][0] = NAN;
+        self->measured[k][1] = NAN;
+    }
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        self->innovation[ch] = NAN;
+    }
+}
+
+static void restart(estimator_t *self)
+{
+    self->counters.restarts++;
+    forget(self);
+}
+
+estimator_error_t estimator_init(estimator_t *self, const est_setting_t *setting)
+{
+    memset(self, 0, sizeof *self);
+    if (setting->delay_steps < 0 || setting->max_gap_steps < 1 ||
+        setting->delay_steps + setting->max_gap_steps + MHE_NODES > ESTIMATOR_RING || setting->max_sweeps < 1) {
+        return ESTIMATOR_BAD_SETTING;
+    }
+    self->setting = *setting;
+    forget(self);
+    return ESTIMATOR_OK;
+}
+
+/* The unwrapped tick nearest to `near`; ticks more than half the range apart cannot be told from a step back. */
+static int64_t unwrap(int64_t near, uint16_t tick16)
+{
+    return near + (int16_t)(uint16_t)(tick16 - (uint16_t)near);
+}
+
+/* Node k's interval covers ticks 10 k + 1 ... 10 k + 10 after the grid tick. */
+static int64_t interval_of(const estimator_t *self, int64_t tick)
+{
+    const int64_t after = tick - self->grid_tick - 1;
+    return after >= 0 ? after / ESTIMATOR_TICKS : -((ESTIMATOR_TICKS - 1 - after) / ESTIMATOR_TICKS);
+}
+
+/* The plant started again, or so much is missing that the net's memory is worth nothing: begin at this frame. */
+static void restart_at(estimator_t *self, uint16_t tick16)
+{
+    restart(self);
+    self->motor_seen = true;
+    self->newest_tick = tick16;
+}
+
+/* Unwrap the tick of a motor frame and make it the newest; false: a repeat, nothing to use. */
+static bool take_tick(estimator_t *self, uint16_t tick16)
+{
+    const int64_t most = (int64_t)ESTIMATOR_TICKS * self->setting.max_gap_steps;
+    if (!self->motor_seen) {
+        const int64_t tick = self->anchored ? unwrap(self->grid_tick, tick16) : tick16;
+        if (self->anchored && (tick - self->grid_tick > most || self->grid_tick - tick > most)) {
+            self->anchored = false; /* that grid was another run's */
+        }
+        self->motor_seen = true;
+        self->newest_tick = tick;
+        return true;
+    }
+    const int64_t tick = unwrap(self->newest_tick, tick16);
+    if (tick == self->newest_tick) {
+        self->counters.repeated_ticks++;
+        return false;
+    }
+    const bool jumped = tick < self->newest_tick || tick - self->newest_tick > most;
+    /* Frames may pile up while nobody calls estimator_step(); what can be worked off at once is bounded. */
+    const bool piled = self->anchored && interval_of(self, tick) - self->next_interval > self->setting.max_gap_steps;
+    if (jumped || piled) {
+        restart_at(self, tick16);
+    } else {
+        self->newest_tick = tick;
+    }
+    return true;
+}
+
+void estimator_feed_motor(estimator_t *self, uint16_t tick16, double torque_nm, double speed_rpm, bool valid)
+{
+    if (!take_tick(self, tick16)) {
+        return;
+    }
+    if (!valid || !isfinite(torque_nm) || !isfinite(speed_rpm)) {
+        self->counters.invalid_inputs++;
+        return;
+    }
+    if (!self->anchored || self->newest_tick <= self->grid_tick) {
+        self->held_input[0] = speed_rpm; /* should the first interval stay without a frame */
+        self->held_input[1] = torque_nm;
+        return;
+    }
+    const int64_t k = interval_of(self, self->newest_tick);
+    if (k < self->next_interval) {
+        return;
+    }
+    estimator_bin_t *bin = &self->bin[slot(k)];
+    bin->speed_sum += speed_rpm;
+    bin->torque_sum += torque_nm;
+    bin->frames++;
+}
+
+/* A measurement for node k: into the window if the node is there, else into the ring for when it comes. */
+static void place_measurement(estimator_t *self, int64_t k, int channel, double y)
+{
+    const int64_t newest_node = self->next_interval - self->setting.delay_steps; /* of the MHE, if started */
+    if (self->started && k <= newest_node) {
+        const double innovation = mhe_measure(&self->mhe, (int)(newest_node - k), channel, y);
+        if (isnan(innovation)) {
+            self->counters.late_measurements++;
+            return;
+        }
+        self->innovation[channel] = innovation;
+        self->measurement_pending = true;
+        return;
+    }
+    if (k < 0 || k <= newest_node) {
+        self->early_sum[channel] += y;
+        self->early_count[channel]++;
+        return;
+    }
+    self->measured[slot(k)][channel] = y;
+}
+
+void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc, double theta_r_degc, bool w_valid,
+                         bool r_valid)
+{
+    const double y[MHE_CHANNELS] = {theta_w_degc - self->setting.offset_degc, theta_r_degc - self->setting.offset_degc};
+    const bool valid[MHE_CHANNELS] = {w_valid && isfinite(theta_w_degc), r_valid && isfinite(theta_r_degc)};
+    int64_t tick = self->motor_seen ? unwrap(self->newest_tick, tick16)
+                   : self->anchored ? unwrap(self->newest_temp_tick, tick16)
+                                    : tick16;
+
+    /* The grid starts with the last temperature frame before the first motor frame that follows it. */
+    const bool waiting = !self->anchored || !self->motor_seen || self->newest_tick <= self->grid_tick;
+    if (waiting && (!self->anchored || tick != self->newest_temp_tick)) {
+        memset(self->early_sum, 0, sizeof self->early_sum);
+        memset(self->early_count, 0, sizeof self->early_count);
+        self->anchored = true;
+        self->grid_tick = tick;
+    }
+    const int64_t after = tick - self->grid_tick;
+    const int64_t node = after / ESTIMATOR_TICKS - self->setting.delay_steps;
+    if (after < 0 || after % ESTIMATOR_TICKS != 0) {
+        self->counters.off_grid++;
+        if (++self->off_grid_run >= OFF_GRID_LIMIT) {
+            restart(self);
+        }
+        return;
+    }
+    /* Far ahead of the motor frames: the ring does not reach that far. A restart follows when motor frames do. */
+    if (node - (self->next_interval - self->setting.delay_steps) >= ESTIMATOR_RING) {
+        return;
+    }
+    self->off_grid_run = 0;
+    self->newest_temp_tick = tick;
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        if (valid[ch]) {
+            self->last_measured_tick[ch] = tick;
+            place_measurement(self, node, ch, y[ch]);
+        }
+    }
+}
+
+/* Close interval k: the mean of its frames, or the last input held. */
+static void close_interval(estimator_t *self, int64_t k, bool *stale)
+{
+    estimator_bin_t *bin = &self->bin[slot(k)];
+    self->newest_held = bin->frames == 0;
+    if (bin->frames > 0) {
+        self->held_input[0] = bin->speed_sum / bin->frames;
+        self->held_input[1] = bin->torque_sum / bin->frames;
+    } else {
+        self->counters.held_intervals++;
+        *stale = true;
+    }
+    memcpy(self->input[slot(k)], self->held_input, sizeof self->held_input);
+    *bin = (estimator_bin_t){0};
+}
+
+/* Open the MHE's window at node k once each channel has a measurement to start from. */
+static bool start_at(estimator_t *self, int64_t k)
+{
+    double prior[MHE_CHANNELS];
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        const double now = self->measured[slot(k)][ch];
+        if (self->early_count[ch] == 0 && isnan(now)) {
+            return false;
+        }
+        prior[ch] = self->early_count[ch] > 0 ? self->early_sum[ch] / self->early_count[ch] : now;
+    }
+    double c[LSTM_HIDDEN] = {0};
+    double h[LSTM_HIDDEN] = {0};
+    double rate[MHE_CHANNELS];
+    double tape[LSTM_TAPE];
+    /* With delay 0 the interval after node k is not known yet; the one before it is the nearest there is. */
+    const int64_t first = self->setting.delay_steps > 0 ? k : k - 1;
+    for (int step = 0; step < self->setting.spin_up_steps && first >= 0; step++) {
+        lstm_forward(self->input[slot(first)], prior, c, h, c, h, rate, tape);
+    }
+    mhe_start(&self->mhe, prior, c, h);
+    self->started = true;
+    return true;
+}
+
+/* The window could not open at node k: what was measured there counts for the prior of a later one. */
+static void keep_early(estimator_t *self, int64_t k)
+{
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        const double y = self->measured[slot(k)][ch];
+        if (!isnan(y)) {
+            self->early_sum[ch] += y;
+            self->early_count[ch]++;
+            self->measured[slot(k)][ch] = NAN;
+        }
+    }
+}
+
+/* Move the pending measurements of node k into the window. */
+static void measure_newest(estimator_t *self, int64_t k)
+{
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        const double y = self->measured[slot(k)][ch];
+        self->measured[slot(k)][ch] = NAN;
+        if (!isnan(y)) {
+            self->innovation[ch] = mhe_measure(&self->mhe, 0, ch, y);
+        }
+    }
+}
+
+/* MHE at the delayed node, then the net forward to node `now` with the stored inputs. */
+static void solve(estimator_t *self, int64_t now, estimator_out_t *out)
+{
+    mhe_result_t result;
+    const mhe_status_t status = mhe_solve(&self->mhe, &result);
+    const mhe_node_t *node = mhe_node(&self->mhe, 0);
+    double rate[MHE_CHANNELS];
+    double tape[LSTM_TAPE];
+    double sum = 0.0;
+
+    self->measurement_pending = false;
+    self->counters.unconverged += status == MHE_MAX_SWEEPS;
+    out->sweeps = result.sweeps > out->sweeps ? result.sweeps : out->sweeps;
+    out->kkt_degc = result.kkt_degc;
+    memcpy(self->theta, node->theta, sizeof self->theta);
+    memcpy(self->c, node->c, sizeof self->c);
+    memcpy(self->h, node->h, sizeof self->h);
+    for (int64_t k = now - self->setting.delay_steps; k < now; k++) {
+        lstm_forward(self->input[slot(k)], self->theta, self->c, self->h, self->c, self->h, rate, tape);
+        for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+            self->theta[ch] += LSTM_DT_S * rate[ch];
+        }
+    }
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        sum += self->theta[ch];
+    }
+    if (status == MHE_INVALID || !isfinite(sum)) {
+        self->invalid_pending = true;
+        restart(self);
+    }
+}
+
+/* Interval k is over: one step of the net's rate, whatever the loop's period. */
+static void consume_interval(estimator_t *self, estimator_out_t *out)
+{
+    const int64_t k = self->next_interval;
+    close_interval(self, k, &out->stale_input);
+    self->next_interval = k + 1;
+    out->intervals++;
+
+    const int64_t node = k + 1 - self->setting.delay_steps;
+    if (!self->started) {
+        if (node < 0) {
+            return;
+        }
+        if (!start_at(self, node)) {
+            keep_early(self, node);
+            return;
+        }
+    } else {
+        mhe_advance(&self->mhe, self->input[slot(node - 1)]);
+    }
+    measure_newest(self, node);
+    solve(self, k + 1, out);
+}
+
+/* The estimate at the newest motor frame: the grid node's, moved by the rate for the frames since. */
+static void publish_theta(const estimator_t *self, estimator_out_t *out)
+{
+    const int64_t since = self->newest_tick - self->grid_tick - ESTIMATOR_TICKS * self->next_interval;
+    double theta[MHE_CHANNELS] = {self->theta[0], self->theta[1]};
+    if (since > 0) {
+        const estimator_bin_t *bin = &self->bin[slot(self->next_interval)];
+        double input[2] = {self->held_input[0], self->held_input[1]};
+        double c[LSTM_HIDDEN];
+        double h[LSTM_HIDDEN];
+        double rate[MHE_CHANNELS];
+        double tape[LSTM_TAPE];
+        if (bin->frames > 0) {
+            input[0] = bin->speed_sum / bin->frames;
+            input[1] = bin->torque_sum / bin->frames;
+        }
+        lstm_forward(input, theta, self->c, self->h, c, h, rate, tape);
+        for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+            theta[ch] += rate[ch] * ESTIMATOR_TICK_S * (double)since;
+        }
+    }
+    out->theta_w_degc = theta[0];
+    out->theta_r_degc = theta[1];
+}
+
+static estimator_status_t status_now(const estimator_t *self)
+{
+    if (!self->started) {
+        return self->anchored && self->motor_seen ? ESTIMATOR_STARTING : ESTIMATOR_INIT;
+    }
+    /* Temperature frames that run ahead show that motor frames have stopped. */
+    if (self->newest_held || self->newest_temp_tick - self->newest_tick > 2 * ESTIMATOR_TICKS) {
+        return ESTIMATOR_INPUT_STALE;
+    }
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        const double age_s = ESTIMATOR_TICK_S * (double)(self->newest_tick - self->last_measured_tick[ch]);
+        if (age_s > self->setting.sensor_timeout_s) {
+            return ESTIMATOR_PREDICTING;
+        }
+    }
+    return ESTIMATOR_RUNNING;
+}
+
+void estimator_step(estimator_t *self, estimator_out_t *out)
+{
+    *out = (estimator_out_t){
+        .theta_w_degc = NAN, .theta_r_degc = NAN, .innov_w_degc = NAN, .innov_r_degc = NAN, .kkt_degc = NAN,
+        .tick = self->newest_tick, .tick16 = (uint16_t)self->newest_tick};
+    while (self->anchored && self->motor_seen &&
+           self->newest_tick >= self->grid_tick + ESTIMATOR_TICKS * (self->next_interval + 1)) {
+        consume_interval(self, out);
+    }
+    if (self->measurement_pending && self->started) {
+        solve(self, self->next_interval, out);
+    }
+    if (self->started) {
+        publish_theta(self, out);
+    }
+    out->status = self->invalid_pending ? ESTIMATOR_INVALID : status_now(self);
+    self->invalid_pending = false;
+    out->stale_input |= out->status == ESTIMATOR_INPUT_STALE;
+    out->innov_w_degc = self->innovation[0];
+    out->innov_r_degc = self->innovation[1];
+    self->innovation[0] = NAN;
+    self->innovation[1] = NAN;
+}

@@ -1,0 +1,92 @@
+/* Moving horizon estimation of winding and rotor temperature with the trained LSTM as its model.
+ *
+ *   theta_{k+1} = theta_k + dt F(u_k, theta_k, c_k, h_k) + w_k,   (c, h)_{k+1} = LSTM(u_k, theta_k, c_k, h_k)
+ *   min 1/2 |theta_0 - prior|^2_P0 + 1/2 sum |y_k - theta_k|^2_Wy + 1/2 sum |w_k|^2_Ww   over up to 16 nodes
+ *
+ * with c_0, h_0 given. w is eliminated, so the unknowns are theta_0..theta_15 alone; c and h follow by recursion.
+ * Each sweep: the net forward over the window, its exact adjoint backward (hence the exact gradient), one
+ * tridiagonal solve per channel with the Gauss-Newton matrix that keeps each stage's direct slope but leaves out what
+ * passes through the net's memory. Its fixed point is the exact KKT point of the problem above.
+ *
+ * Everything: no allocation, no clock, no printing; one thread at a time per object; state sizeof(mhe_t) (15 kB with 8
+ * cells), owned by the caller. Without an active bound no branch depends on data other than the number of sweeps. */
+#ifndef MHE_H
+#define MHE_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "box_qp.h"
+#include "est_settings.h"
+#include "lstm_net.h"
+
+#define MHE_NODES 16 /* N = 15 stages; a power of two, the window is a ring */
+#define MHE_CHANNELS 2 /* 0 winding, 1 rotor */
+
+typedef enum {
+    MHE_OK = 0,
+    MHE_MAX_SWEEPS = 1, /* best iterate returned; the tolerance was not met */
+    MHE_INVALID = 2,    /* not started, or a result that is not finite: start again */
+} mhe_status_t;
+
+typedef struct {
+    double theta[MHE_CHANNELS];  /* the estimate at this node */
+    double u[2];                 /* [speed rpm, torque Nm] of the stage that leaves this node */
+    double y[MHE_CHANNELS];      /* measurement, offset removed */
+    double weight[MHE_CHANNELS]; /* Wy, or 0 where there is none */
+    double c[LSTM_HIDDEN];       /* memory on arrival at this node */
+    double h[LSTM_HIDDEN];
+    double rate[MHE_CHANNELS];   /* F of the stage that leaves this node */
+    double slope[MHE_CHANNELS];  /* 1 + dt dF/dtheta of that stage, direct part */
+    double tape[LSTM_TAPE];
+} mhe_node_t;
+
+typedef struct {
+    double weight_measurement[MHE_CHANNELS];
+    double weight_noise[MHE_CHANNELS];
+    double weight_arrival[MHE_CHANNELS];
+    double weight_prior[MHE_CHANNELS];
+    double lower, upper, tolerance;
+    int max_sweeps;
+    bool newest_measurement;
+
+    mhe_node_t node[MHE_NODES];
+    int head;                    /* ring index of the oldest node */
+    int count;                   /* nodes in the window, 0 before mhe_start() */
+    bool full;                   /* the window has shifted at least once: arrival weight instead of prior weight */
+    double prior[MHE_CHANNELS];  /* theta bar of the oldest node */
+    box_qp_t qp[MHE_CHANNELS];
+} mhe_t;
+
+typedef struct {
+    double theta[MHE_CHANNELS]; /* at the newest node */
+    double kkt_degc;            /* largest change the last tridiagonal solve asked for: the KKT residual in degC */
+    int sweeps;                 /* gradient sweeps done */
+    int active;                 /* active-set changes, both channels, all sweeps; 0: no bound was met */
+} mhe_result_t;
+
+/* Take the weights, bounds and tolerances of `setting`; the window is empty. Copies; never fails. < 1 us. */
+void mhe_init(mhe_t *self, const est_setting_t *setting);
+
+/* Begin a window of one node with that prior and that memory of the net (LSTM_HIDDEN each). Never fails. */
+void mhe_start(mhe_t *self, const double prior[MHE_CHANNELS], const double c[], const double h[]);
+
+/* Append a node: the newest one plus one step of the net with u = [speed rpm, torque Nm]. A full window drops its
+ * oldest node; the prior becomes the last solution at the new oldest node, whose memory is kept. One net step. */
+void mhe_advance(mhe_t *self, const double u[2]);
+
+/* Attach measurement y (offset removed) to the node `age` steps before the newest and return the innovation: y minus
+ * what the window said before. A node outside the window or a value that is not finite is ignored: returns NAN. */
+double mhe_measure(mhe_t *self, int age, int channel, double y);
+
+/* Solve from the present window. Cost: (sweeps - 1) forward passes and `sweeps` adjoint passes over the window. */
+mhe_status_t mhe_solve(mhe_t *self, mhe_result_t *result);
+
+/* The node `age` steps before the newest, NULL outside the window. The newest node's c, h belong to the solution. */
+const mhe_node_t *mhe_node(const mhe_t *self, int age);
+
+/* The cost at the present temperatures and its gradient (count rows of [winding, rotor], oldest first), bounds left
+ * out; runs a forward and an adjoint pass. For tests. */
+double mhe_cost(mhe_t *self, double gradient[][MHE_CHANNELS]);
+
+#endif

@@ -1,0 +1,243 @@
+"""ctypes binding of the estimator's C: the same functions the binary runs, driven from Python."""
+
+from __future__ import annotations
+
+import ctypes as ct
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCES = ("src/mhe.c", "src/estimator.c", "src/solver/tridiag.c", "src/solver/box_qp.c")
+SETTINGS = ROOT / "estimator_c" / "settings"
+WEIGHTS = ROOT / "estimator_c" / "weights" / "lstm8.json"
+NODES = 16
+
+f64 = ct.c_double
+pair = f64 * 2
+
+
+class Setting(ct.Structure):
+    """est_setting_t of the generated est_settings.h (checked against the schema by `load`)."""
+
+    _fields_ = (
+        ("name", ct.c_char_p), ("id", ct.c_int32),
+        ("delay_steps", ct.c_int32), ("offset_degc", f64), ("sensor_timeout_s", f64),
+        ("weight_measurement", pair), ("weight_noise", pair), ("weight_arrival", pair), ("weight_prior", pair),
+        ("newest_measurement", ct.c_bool), ("hard_bounds", ct.c_bool),
+        ("lower_degc", f64), ("upper_degc", f64), ("bound_weight", f64),
+        ("max_sweeps", ct.c_int32), ("tolerance_degc", f64),
+        ("spin_up_steps", ct.c_int32), ("max_gap_steps", ct.c_int32),
+    )  # fmt: skip
+
+
+class MheResult(ct.Structure):
+    """mhe_result_t."""
+
+    _fields_ = (("theta", pair), ("kkt_degc", f64), ("sweeps", ct.c_int), ("active", ct.c_int))
+
+
+class Counters(ct.Structure):
+    """estimator_counters_t."""
+
+    _fields_ = tuple(
+        (name, ct.c_uint32)
+        for name in ("restarts", "held_intervals", "repeated_ticks", "invalid_inputs", "off_grid",
+                     "late_measurements", "unconverged")
+    )  # fmt: skip
+
+
+class Out(ct.Structure):
+    """estimator_out_t."""
+
+    _fields_ = (
+        ("theta_w_degc", f64), ("theta_r_degc", f64), ("innov_w_degc", f64), ("innov_r_degc", f64),
+        ("tick", ct.c_int64), ("tick16", ct.c_uint16), ("status", ct.c_int), ("stale_input", ct.c_bool),
+        ("intervals", ct.c_int32), ("sweeps", ct.c_int32), ("kkt_degc", f64),
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=None)
+def load(weights: Path | None = None) -> Lib:
+    """The estimator's library: compiled from the given weights, or build/lib when it carries lstm8.json.
+
+    RT_LIBESTIMATOR names a library to use instead of build/lib/libestimator.so (an ASan build, say).
+    """
+    if weights is None:
+        built = Path(os.environ.get("RT_LIBESTIMATOR", ROOT / "build" / "lib" / "libestimator.so"))
+        if built.exists():
+            return Lib(built)
+        weights = WEIGHTS
+    return Lib(compile_library(weights))
+
+
+def compile_library(weights: Path, flags: tuple[str, ...] = ("-O2",)) -> Path:
+    """Generate the C of `weights` and compile it into a folder of this run; returns the shared library."""
+    from estimator_c.formulation.generate import generate
+
+    folder = Path(tempfile.gettempdir()) / f"rt-libest-{os.getuid()}-{os.getpid()}"
+    key = hashlib.sha256(weights.read_bytes() + " ".join(flags).encode()).hexdigest()[:16]
+    out = folder / key
+    library = out / "libestimator.so"
+    if library.exists():
+        return library
+    generated = generate(weights, SETTINGS, out)
+    base = ROOT / "estimator_c"
+    command = ["gcc", "-std=c11", "-D_GNU_SOURCE", "-g", "-fPIC", "-shared", "-fno-math-errno", *flags]
+    command += [f"-I{base / 'src'}", f"-I{base / 'src' / 'solver'}", f"-I{out}"]
+    command += [str(base / source) for source in SOURCES]
+    command += [str(path) for path in generated if path.suffix == ".c"] + ["-o", str(library), "-lm"]
+    subprocess.run(command, check=True, stdout=sys.stderr)
+    return library
+
+
+class Lib:
+    """The shared library with typed entry points."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.c = ct.CDLL(str(path))
+        self.c.est_setting_find.restype = ct.POINTER(Setting)
+        self.c.est_setting_find.argtypes = [ct.c_char_p]
+        self.c.mhe_measure.restype = f64
+        self.c.mhe_measure.argtypes = [ct.c_void_p, ct.c_int, ct.c_int, f64]
+        self.c.mhe_cost.restype = f64
+        self.c.mhe_cost.argtypes = [ct.c_void_p, ct.c_void_p]
+        self.c.mhe_node.restype = ct.POINTER(f64)
+        self.c.mhe_node.argtypes = [ct.c_void_p, ct.c_int]
+        self.c.estimator_feed_motor.argtypes = [ct.c_void_p, ct.c_uint16, f64, f64, ct.c_bool]
+        self.c.estimator_feed_motor.restype = None
+        self.c.estimator_feed_temp.argtypes = [ct.c_void_p, ct.c_uint16, f64, f64, ct.c_bool, ct.c_bool]
+        self.c.estimator_feed_temp.restype = None
+        self.c.estimator_step.argtypes = [ct.c_void_p, ct.POINTER(Out)]
+        self.c.estimator_step.restype = None
+        for name in ("mhe_init", "mhe_start", "mhe_advance", "mhe_solve", "estimator_init"):
+            getattr(self.c, name).argtypes = None
+        self.sha256 = (ct.c_char * 65).in_dll(self.c, "lstm_weights_sha256").value.decode()
+
+    def setting(self, name: str, **changes: Any) -> Setting:
+        """A copy of a compiled-in setting, with fields replaced (pairs as tuples)."""
+        found = self.c.est_setting_find(name.encode())
+        if not found:
+            raise KeyError(name)
+        setting = Setting.from_buffer_copy(found.contents)
+        for field, value in changes.items():
+            if field not in dict(Setting._fields_):
+                raise KeyError(field)
+            setattr(setting, field, pair(*value) if isinstance(value, tuple) else value)
+        return setting
+
+    def lstm_forward(self, u: Any, theta: Any, c: Any, h: Any) -> tuple[np.ndarray, ...]:
+        """(c_next, h_next, rate, tape) of one step."""
+        n = len(c)
+        outs = [np.zeros(n), np.zeros(n), np.zeros(2), np.zeros(5 * n)]
+        self.c.lstm_forward(*(_ptr(_f64(a)) for a in (u, theta, c, h)), *(_ptr(a) for a in outs))
+        return tuple(outs)
+
+    def lstm_adjoint(self, tape: Any, c: Any, rate_bar: Any, c_bar: Any, h_bar: Any) -> tuple[np.ndarray, ...]:
+        """(theta_bar, c_bar, h_bar) of one step."""
+        n = len(c)
+        outs = [np.zeros(2), np.zeros(n), np.zeros(n)]
+        ins = (tape, c, rate_bar, c_bar, h_bar)
+        self.c.lstm_adjoint(*(_ptr(_f64(a)) for a in ins), *(_ptr(a) for a in outs))
+        return tuple(outs)
+
+    def lstm_slope(self, tape: Any, c: Any) -> np.ndarray:
+        """[drate_w/dtheta_w, drate_r/dtheta_r] of one step."""
+        out = np.zeros(2)
+        self.c.lstm_slope(_ptr(_f64(tape)), _ptr(_f64(c)), _ptr(out))
+        return out
+
+
+_KEEP: list[np.ndarray] = []
+
+
+def _f64(values: Any) -> np.ndarray:
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    _KEEP[:] = [*_KEEP[-16:], array]  # alive until the call has read it
+    return array
+
+
+def _ptr(array: np.ndarray) -> Any:
+    return array.ctypes.data_as(ct.c_void_p)
+
+
+class Mhe:
+    """One mhe_t."""
+
+    SIZE = 1 << 16
+
+    def __init__(self, lib: Lib, setting: Setting) -> None:
+        self.lib, self.memory, self.count = lib, ct.create_string_buffer(self.SIZE), 0
+        lib.c.mhe_init(self.memory, ct.byref(setting))
+
+    def start(self, prior: Any, c: Any, h: Any) -> None:
+        self.lib.c.mhe_start(self.memory, *(_ptr(_f64(a)) for a in (prior, c, h)))
+        self.count = 1
+
+    def advance(self, u: Any) -> None:
+        self.lib.c.mhe_advance(self.memory, _ptr(_f64(u)))
+        self.count = min(self.count + 1, NODES)
+
+    def measure(self, age: int, channel: int, y: float) -> float:
+        return self.lib.c.mhe_measure(self.memory, age, channel, y)
+
+    def solve(self) -> tuple[int, MheResult]:
+        result = MheResult()
+        return self.lib.c.mhe_solve(self.memory, ct.byref(result)), result
+
+    def theta(self) -> np.ndarray:
+        """Temperatures of the window, oldest first: (count, 2)."""
+        rows = []
+        for age in range(self.count - 1, -1, -1):
+            node = self.lib.c.mhe_node(self.memory, age)
+            rows.append([node[0], node[1]])
+        return np.array(rows)
+
+    def set_theta(self, theta: np.ndarray) -> None:
+        """Move the window's temperatures (for derivative checks)."""
+        for row, age in enumerate(range(self.count - 1, -1, -1)):
+            node = self.lib.c.mhe_node(self.memory, age)
+            node[0], node[1] = float(theta[row, 0]), float(theta[row, 1])
+
+    def memory_of(self, age: int, hidden: int) -> tuple[np.ndarray, np.ndarray]:
+        """(c, h) on arrival at a node."""
+        node = self.lib.c.mhe_node(self.memory, age)
+        return np.array(node[8 : 8 + hidden]), np.array(node[8 + hidden : 8 + 2 * hidden])
+
+    def cost(self) -> tuple[float, np.ndarray]:
+        gradient = np.zeros((NODES, 2))
+        return self.lib.c.mhe_cost(self.memory, _ptr(gradient)), gradient[: self.count]
+
+
+class Estimator:
+    """One estimator_t."""
+
+    SIZE = 1 << 17
+
+    def __init__(self, lib: Lib, setting: Setting) -> None:
+        self.lib, self.memory = lib, ct.create_string_buffer(self.SIZE)
+        self.error = lib.c.estimator_init(self.memory, ct.byref(setting))
+        self._step, self._out = lib.c.estimator_step, Out()
+
+    def feed_motor(self, tick: int, torque_nm: float, speed_rpm: float, valid: bool = True) -> None:
+        self.lib.c.estimator_feed_motor(self.memory, tick & 0xFFFF, torque_nm, speed_rpm, valid)
+
+    def feed_temp(self, tick: int, w: float, r: float, w_valid: bool = True, r_valid: bool = True) -> None:
+        self.lib.c.estimator_feed_temp(self.memory, tick & 0xFFFF, w, r, w_valid, r_valid)
+
+    def step(self) -> Out:
+        self._step(self.memory, ct.byref(self._out))
+        return Out.from_buffer_copy(self._out)
+
+    @property
+    def counters(self) -> Counters:
+        offset = (ct.sizeof(Setting) + 7) // 8 * 8
+        return Counters.from_buffer_copy(self.memory, offset)
