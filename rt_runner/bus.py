@@ -108,7 +108,7 @@ def choose_bus(wanted: str = "auto") -> BusChoice:
     elif name.startswith("vcan"):
         remedy = f"create it with 'rt-runner vcan up --name {name}'"
     else:
-        remedy = f"connect {name} and bring it up with its bit rate (ip link set {name} up type can bitrate ...)"
+        remedy = f"bring it up with its bit rate (ip link set {name} up type can bitrate ...)"
     raise SetupError(f"bus {name}: {trouble}; {remedy}, or take --bus hub")
 
 

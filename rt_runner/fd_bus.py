@@ -1,8 +1,8 @@
 """A bus is a file descriptor that yields CAN frames: what our transports share as python-can buses.
 
-The C twin is ``estimator_c/src/can_port.c``. One datagram is one kernel frame (``struct can_frame``, 16 bytes,
-or ``struct canfd_frame``, 72 bytes), stamped by the kernel on arrival. Transports differ only in how they open
-the socket.
+The C twin is ``estimator_c/src/can_port.c``. One datagram is one kernel frame (``struct can_frame``, 16
+bytes, or ``struct canfd_frame``, 72 bytes), stamped by the kernel on arrival. Transports differ only in how
+they open the socket.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ class FdBus(can.BusABC):
     """A python-can bus on a connected socket; subclasses open it and name it.
 
     Counters only grow: ``received`` and ``sent`` frames, ``rx_drops`` (lost by the kernel because we read too
-    slowly; never on the hub), ``rejected`` (datagrams that are no CAN frame, skipped). ``rx_ns`` is the receive
-    stamp of the last message in integer ns UTC: ``Message.timestamp`` is a float, good to 0.2 µs only.
+    slowly; never on the hub), ``rejected`` (datagrams that are no CAN frame, skipped). ``rx_ns`` is the
+    receive stamp of the last message in integer ns UTC: ``Message.timestamp`` is a float, good to 0.2 µs.
 
     Parameters
     ----------

@@ -178,14 +178,14 @@ static void remove_own_socket(const char *path, const struct stat *identity)
   }
 }
 
-static void accept_client(hub_t *hub, int listener)
+static bool accept_one(hub_t *hub, int listener)
 {
   const int fd = accept4(listener, NULL, NULL, SOCK_CLOEXEC | SOCK_NONBLOCK);
   struct ucred who = {0};
   socklen_t size = sizeof who;
   char path[32], name[HUB_NAME_MAX] = "";
   if (fd < 0) {
-    return; /* gone again, or no descriptors left: the client sees a closed connection */
+    return false;
   }
   (void)getsockopt(fd, SOL_SOCKET, SO_PEERCRED, &who, &size);
   (void)snprintf(path, sizeof path, "/proc/%d/comm", (int)who.pid);
@@ -196,7 +196,14 @@ static void accept_client(hub_t *hub, int listener)
     (void)close(comm);
   }
   if (!hub_add(hub, fd, who.pid, name)) {
-    (void)close(fd);
+    (void)close(fd); /* the client sees a closed connection */
+  }
+  return true;
+}
+
+static void accept_all(hub_t *hub, int listener)
+{
+  while (accept_one(hub, listener)) {
   }
 }
 
@@ -261,9 +268,15 @@ static void serve(hub_t *hub, int listener, int signals, double *stall_s)
     if (poll(fds, (nfds_t)(2 + count), hub_poll_timeout_ms(hub)) < 0) {
       continue; /* EINTR */
     }
-    hub_step(hub, &fds[2], count, now_ns(), say_stalled, stall_s);
+    if (hub->blocked) {
+      hub_hand_out(hub, now_ns(), say_stalled, stall_s);
+    }
+    while (hub_take(hub, &fds[2], count)) {
+      accept_all(hub, listener);
+      hub_hand_out(hub, now_ns(), say_stalled, stall_s);
+    }
     if ((fds[1].revents & POLLIN) != 0) {
-      accept_client(hub, listener);
+      accept_all(hub, listener);
     }
   }
 }

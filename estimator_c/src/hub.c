@@ -36,7 +36,7 @@ bool hub_add(hub_t *self, int fd, int32_t pid, const char *name)
     if (setsockopt(fd, SOL_SOCKET, SO_SNDBUFFORCE, &bytes, sizeof bytes) != 0) {
       (void)setsockopt(fd, SOL_SOCKET, SO_SNDBUF, &bytes, sizeof bytes); /* capped by net.core.wmem_max */
     }
-    *c = (hub_client_t){.fd = fd, .pid = pid, .sent = self->batch_len, .blocked_since_ns = -1};
+    *c = (hub_client_t){.fd = fd, .pid = pid, .sent = self->fresh ? 0 : self->batch_len, .blocked_since_ns = -1};
     (void)snprintf(c->name, sizeof c->name, "%s", name != NULL ? name : "");
     if (i >= self->top) {
       self->top = i + 1;
@@ -87,10 +87,10 @@ int hub_poll_timeout_ms(const hub_t *self)
   return self->blocked ? HUB_RETRY_MS : -1;
 }
 
-/* Give the rest of the batch to everybody who has not got all of it. */
-static void hand_out(hub_t *self, int64_t now_ns, hub_on_stall_t on_stall, void *context)
+void hub_hand_out(hub_t *self, int64_t now_ns, hub_on_stall_t on_stall, void *context)
 {
   bool blocked = false;
+  self->fresh = false;
   for (uint32_t i = 0; i < self->top; i++) {
     hub_client_t *c = &self->clients[i];
     while (waited_for(self, c)) {
@@ -157,7 +157,6 @@ static bool take_batch(hub_t *self, hub_client_t *c)
     self->out_iov[self->batch_len++] = (struct iovec){.iov_base = &self->frames[i], .iov_len = size};
   }
   self->counters.frames += self->batch_len;
-  c->sent = self->batch_len; /* nobody hears himself */
   if (empty > 0 && ended(c->fd)) {
     remove_client(self, c);
   } else {
@@ -166,36 +165,32 @@ static bool take_batch(hub_t *self, hub_client_t *c)
   return self->batch_len > 0;
 }
 
-void hub_step(hub_t *self, const struct pollfd *fds, size_t count, int64_t now_ns, hub_on_stall_t on_stall,
-              void *context)
+bool hub_take(hub_t *self, struct pollfd *fds, size_t count)
 {
   if (self->blocked) {
-    hand_out(self, now_ns, on_stall, context);
-    return; /* the caller polls again: what was asked for while blocked says nothing about who can be read */
+    return false; /* who was polled while blocked says nothing about who can be read */
   }
-  for (size_t k = 0; k < count && !self->blocked; k++) {
+  for (size_t k = 0; k < count; k++) {
     const size_t i = (self->turn + k) % count;
     hub_client_t *c = &self->clients[i];
-    if (c->fd < 0 || c->fd != fds[i].fd || fds[i].revents == 0 || !take_batch(self, c)) {
-      continue;
-    }
-    for (uint32_t j = 0; j < self->top; j++) {
-      if (j != i) {
+    const bool readable = fds[i].revents != 0 && c->fd >= 0 && c->fd == fds[i].fd;
+    fds[i].revents = 0;
+    if (readable && take_batch(self, c)) {
+      for (uint32_t j = 0; j < self->top; j++) {
         self->clients[j].sent = 0;
       }
-    }
-    hand_out(self, now_ns, on_stall, context);
-    if (self->blocked) {
-      self->turn = (uint32_t)(i + 1); /* the rest have their turn first */
-      return;
+      c->sent = self->batch_len; /* nobody hears himself */
+      self->turn = (uint32_t)(i + 1);
+      self->fresh = true;
+      return true;
     }
   }
-  self->turn++;
+  return false;
 }
 
 void hub_close(hub_t *self)
 {
-  hand_out(self, self->blocked_since_ns, NULL, NULL);
+  hub_hand_out(self, self->blocked_since_ns, NULL, NULL);
   for (uint32_t i = HUB_CLIENTS_MAX; i-- > 0;) {
     if (self->clients[i].fd >= 0) {
       remove_client(self, &self->clients[i]);

@@ -54,6 +54,7 @@ typedef struct {
   uint32_t top;       /* slots at and above are free */
   uint32_t turn;      /* whose turn it is to be read first */
   uint32_t batch_len; /* frames of the batch now being handed out */
+  bool fresh;         /* the batch has been taken, handing out has not begun */
   bool blocked;       /* some client has not got the whole batch */
   int64_t blocked_since_ns;
   int64_t stall_ns;
@@ -69,7 +70,7 @@ typedef void (*hub_on_stall_t)(const hub_client_t *client, void *context);
 /* Prepare an empty hub. Cost: microseconds, no system call. Cannot fail. The hub points into itself: do not copy it. */
 void hub_init(hub_t *self, int64_t stall_ns);
 
-/* Take over a connected socket; `name` may be NULL. The client gets every frame that is read from now on.
+/* Take over a connected socket; `name` may be NULL. The client gets every frame not yet handed out.
  * Cost: two system calls. Failure: false when the table is full (counted; the caller keeps and closes fd). */
 bool hub_add(hub_t *self, int fd, int32_t pid, const char *name);
 
@@ -79,10 +80,16 @@ size_t hub_poll_set(const hub_t *self, struct pollfd *fds);
 /* How long poll may wait, in ms: -1 for ever, HUB_RETRY_MS while a reader is full. */
 int hub_poll_timeout_ms(const hub_t *self);
 
-/* Do what can be done now, with the `count` entries of hub_poll_set after poll. `now_ns`: monotonic.
- * Reads at most one batch from each client. Cost: one system call per batch and receiver. Never blocks. */
-void hub_step(hub_t *self, const struct pollfd *fds, size_t count, int64_t now_ns, hub_on_stall_t on_stall,
-              void *context);
+/* Take a batch from the next client, in turn, that poll found readable; clears its revents.
+ * `fds`, `count`: from hub_poll_set, after poll. True: there is a batch; now accept everybody who waits to connect
+ * and call hub_hand_out. (Whoever had connected before a frame was sent must see that frame, and connect returns
+ * before accept: so accepting belongs between the two.) False: nobody is readable, or the hub is blocked.
+ * Cost: one system call per client visited. Never blocks. */
+bool hub_take(hub_t *self, struct pollfd *fds, size_t count);
+
+/* Give the batch to everybody who has not got all of it; sets `blocked` if that was not possible. Call it after
+ * hub_take, and after every poll while blocked. `now_ns`: monotonic. Cost: one system call per receiver. */
+void hub_hand_out(hub_t *self, int64_t now_ns, hub_on_stall_t on_stall, void *context);
 
 /* Number of clients. */
 uint32_t hub_clients(const hub_t *self);
