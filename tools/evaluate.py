@@ -2,8 +2,9 @@
 
     python -m tools.evaluate --weights estimator_c/weights/lstm8.json --lap build/data/lap.npz
 
-Rates are compared sample by sample with the plant's temperatures as input (one step ahead). "Open loop" feeds the net its
-own integrated temperatures from the lap's first sample on: what remains when no sensor corrects it.
+Rates are compared sample by sample with the plant's temperatures as input (one step ahead). "Open loop"
+feeds the net its own integrated temperatures from the lap's first sample on: what remains when no sensor
+corrects it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+from estimator_c.formulation.errors import FormulationError
+from estimator_c.formulation.lstm_numpy import lstm_sequence, lstm_step
+from estimator_c.formulation.weights import LstmWeights, load_weights
 
 CHANNELS = ("w", "r")
 LAUNCH_S = 20.0  # the launch from standstill is a third of the winding rate's range, in 3 % of the lap
@@ -30,12 +35,15 @@ COLUMNS = (
 
 
 class DataError(Exception):
-    """A data or weights file that cannot be used; the message says what, where and what to do."""
+    """A data set that cannot be used; the message says what, where and what to do."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of a data set at the net's rate: inputs x (N, 4), rates (N, 2) in °C/s, trajectory ids (N,), hash of the rows."""
+    """Rows of a data set at the net's rate.
+
+    Inputs x (N, 4) in rpm, Nm, °C, °C; rates (N, 2) in °C/s; trajectory numbers (N,); SHA-256 of the rows.
+    """
 
     x: np.ndarray
     rates_degc_s: np.ndarray
@@ -58,7 +66,9 @@ def load_rows(path: Path) -> Rows:
     try:
         with np.load(path, allow_pickle=False) as file:
             columns = [np.asarray(file[name], dtype=np.float64) for name in COLUMNS]
-            trajectory = np.asarray(file["trajectory"]) if "trajectory" in file else np.zeros(len(columns[0]), int)
+            trajectory = (
+                np.asarray(file["trajectory"]) if "trajectory" in file else np.zeros(len(columns[0]), int)
+            )
             sha256 = str(file["sha256"])
     except (OSError, ValueError, KeyError) as error:
         raise DataError(f"data set {path}: {error}; build it with `python -m tools.dataset`") from error
@@ -67,87 +77,27 @@ def load_rows(path: Path) -> Rows:
     return Rows(np.stack(columns[:4], axis=1), np.stack(columns[4:], axis=1), trajectory, sha256)
 
 
-@dataclass(frozen=True)
-class NumpyNet:
-    """The embedded LSTM in readable numpy, float64; one `step` is what the C code computes."""
-
-    dt_s: float
-    in_offset: np.ndarray
-    in_scale: np.ndarray
-    out_offset: np.ndarray
-    out_scale: np.ndarray
-    w_u: np.ndarray
-    w_h: np.ndarray
-    b: np.ndarray
-    w_y: np.ndarray
-    b_y: np.ndarray
-
-    @property
-    def hidden(self) -> int:
-        return self.w_h.shape[1]
-
-    def empty_memory(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.zeros(self.hidden), np.zeros(self.hidden)
-
-    def step(
-        self, x: np.ndarray, memory: tuple[np.ndarray, np.ndarray]
-    ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """One 0.1 s step: x = (rpm, Nm, °C, °C) -> rates (2,) in °C/s and the new memory (c, h)."""
-        c, h = memory
-        m = self.hidden
-        z = self.w_u @ ((x - self.in_offset) / self.in_scale) + self.w_h @ h + self.b
-        gate = 1.0 / (1.0 + np.exp(-z))
-        c = gate[m : 2 * m] * c + gate[:m] * np.tanh(z[2 * m : 3 * m])
-        h = gate[3 * m :] * np.tanh(c)
-        return self.out_offset + self.out_scale * (self.w_y @ h + self.b_y), (c, h)
+def one_step_rates(net: LstmWeights, x: np.ndarray) -> np.ndarray:
+    """Rates (N, 2) in °C/s over the rows x (N, 4) with true temperatures, memory empty at the first row."""
+    return lstm_sequence(net, x)[0]
 
 
-def net_from_document(document: dict) -> NumpyNet:
-    """Numpy net of a weights document (format rt-lstm-weights/1)."""
-    inputs, outputs = (
-        np.array([[p["offset"], p["scale"]] for p in document[side]], dtype=np.float64).T
-        for side in ("inputs", "outputs")
-    )
-    return NumpyNet(
-        float(document["dt_s"]),
-        *inputs,
-        *outputs,
-        *(np.array(document[key], dtype=np.float64) for key in ("W_u", "W_h", "b", "W_y", "b_y")),
-    )
-
-
-def read_document(path: Path) -> dict:
-    """The JSON of a weights file; `estimator_c.formulation.weights` is the strict reader, this one serves the tools."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"weights {path}: {error}; train them with `python -m tools.train`") from error
-
-
-def one_step_rates(net: NumpyNet, x: np.ndarray) -> np.ndarray:
-    """Rates (N, 2) in °C/s over the rows x (N, 4), memory empty at the first row, true temperatures as input."""
-    rates, memory = np.empty((len(x), 2)), net.empty_memory()
-    for k, row in enumerate(x):
-        rates[k], memory = net.step(row, memory)
-    return rates
-
-
-def open_loop(net: NumpyNet, x: np.ndarray) -> np.ndarray:
-    """Temperatures (N, 2) in °C when the net integrates its own rates from the first row's temperatures on."""
-    theta, memory = np.empty((len(x), 2)), net.empty_memory()
+def open_loop(net: LstmWeights, x: np.ndarray) -> np.ndarray:
+    """Temperatures (N, 2) in °C when the net integrates its own rates from the first row on."""
+    theta = np.empty((len(x), 2))
     theta[0] = x[0, 2:]
+    c = h = np.zeros(net.hidden)
     for k in range(len(x) - 1):
-        rate, memory = net.step(np.concatenate((x[k, :2], theta[k])), memory)
+        c, h, rate = lstm_step(net, np.concatenate((x[k, :2], theta[k])), c, h)
         theta[k + 1] = theta[k] + net.dt_s * rate
     return theta
 
 
-def evaluate(net: NumpyNet, rows: Rows) -> dict[str, float]:
+def evaluate(net: LstmWeights, rows: Rows) -> dict[str, float]:
     """Metrics over rows that form one drive, per channel w (winding) and r (rotor).
 
-    Keys `mae`, `rmse`, `mean_error` are in °C/s; `nrmse` divides the RMSE by the range of the true rate over the whole
-    drive, launch included; `nrmse_after_launch` divides the same kind of RMSE by the range, both over t > 20 s;
-    `open_loop_max_degc` and `open_loop_rmse_degc` are the drift of `open_loop`.
+    `nrmse` divides the RMSE by the range of the true rate over the whole drive, launch included;
+    `nrmse_after_launch` takes RMSE and range over t > 20 s; `open_loop_*` is the drift of `open_loop`.
     """
     error = one_step_rates(net, rows.x) - rows.rates_degc_s
     drift = open_loop(net, rows.x) - rows.x[:, 2:]
@@ -185,14 +135,18 @@ def table(metrics: dict[str, float]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tools.evaluate", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.evaluate", description=(__doc__ or "").splitlines()[0]
+    )
     parser.add_argument("--weights", type=Path, required=True)
-    parser.add_argument("--lap", type=Path, required=True, help="rows of one drive, as written by tools.dataset")
+    parser.add_argument(
+        "--lap", type=Path, required=True, help="rows of one drive, as written by tools.dataset"
+    )
     parser.add_argument("--json", type=Path, help="write the figures here too")
     args = parser.parse_args(argv)
     try:
-        metrics = evaluate(net_from_document(read_document(args.weights)), load_rows(args.lap))
-    except DataError as error:
+        metrics = evaluate(load_weights(args.weights), load_rows(args.lap))
+    except (DataError, FormulationError) as error:
         print(f"evaluate: {error}", file=sys.stderr)
         return 1
     print(table(metrics))

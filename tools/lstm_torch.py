@@ -1,12 +1,14 @@
 """The learned thermal model in torch, and its export to the weights text that the C generator reads.
 
-The net is one LSTM layer and a linear output layer: x = (speed, torque, winding and rotor temperature) at 10 Hz in, the
-rates of the two temperatures out. This module and `tools.train` are the only places that import torch.
+The net is one LSTM layer and a linear output layer: x = (speed, torque, winding and rotor temperature) at
+10 Hz in, the rates of the two temperatures out. Only this module, `tools.train` and `tools.train_windows`
+import torch.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,16 +17,14 @@ import numpy as np
 import torch
 from torch import nn
 
-FORMAT = "rt-lstm-weights/1"
-INPUT_NAMES = ("speed_rpm", "torque_nm", "theta_w_degc", "theta_r_degc")
-OUTPUT_NAMES = ("dtheta_w_degc_s", "dtheta_r_degc_s")
+from estimator_c.formulation.weights import FORMAT, INPUTS, OUTPUTS, LstmWeights
 
 
 @dataclass(frozen=True)
 class Scaling:
     """Affine scaling of the net's ports: u = (x − in_offset)/in_scale, y = out_offset + out_scale·y_norm.
 
-    Arrays of shape (4,) and (2,), in the units that the names in `INPUT_NAMES` and `OUTPUT_NAMES` carry.
+    Arrays of shape (4,) and (2,), in the units that the names in `INPUTS` and `OUTPUTS` carry.
     """
 
     in_offset: np.ndarray
@@ -34,9 +34,9 @@ class Scaling:
 
     @classmethod
     def from_rates(cls, rates_degc_s: np.ndarray) -> Scaling:
-        """Inputs near the paper's ranges; outputs by the data's mean and standard deviation, rates of shape (N, 2).
+        """Inputs near the paper's ranges; outputs by mean and standard deviation of the rates, shape (N, 2).
 
-        One scale per channel: with a common scale the rotor, ten times slower, would hardly count in the loss.
+        One scale per channel: with a common one the rotor, ten times slower, would hardly count in the loss.
         """
         return cls(
             in_offset=np.array([0.0, 0.0, 60.0, 60.0]),
@@ -47,12 +47,12 @@ class Scaling:
 
 
 class LstmRates(nn.Module):
-    """LSTM + linear layer on scaled ports: (steps, batch, 4) -> (steps, batch, 2), memory empty at the first step."""
+    """LSTM + linear layer on scaled ports: (steps, batch, 4) -> (steps, batch, 2), from an empty memory."""
 
     def __init__(self, hidden: int) -> None:
         super().__init__()
-        self.lstm = nn.LSTM(len(INPUT_NAMES), hidden)
-        self.head = nn.Linear(hidden, len(OUTPUT_NAMES))
+        self.lstm = nn.LSTM(len(INPUTS), hidden)
+        self.head = nn.Linear(hidden, len(OUTPUTS))
 
     def forward(self, u: torch.Tensor) -> torch.Tensor:
         return self.head(self.lstm(u)[0])
@@ -61,71 +61,68 @@ class LstmRates(nn.Module):
 def spread_time_constants(net: LstmRates, dt_s: float, shortest_s: float, longest_s: float) -> None:
     """Start the cells with memory times spread logarithmically from `shortest_s` to `longest_s`, in place.
 
-    A cell forgets with f = σ(b_f); b_f = ln(τ/dt − 1) gives it the time constant τ at rest, and b_i = −b_f keeps its
-    content near one. The plant's hidden lags (about 8 s and 120 s) are then in reach from the first epoch; from torch's
-    default (τ ≈ 0.2 s) the gradient has to find them through hundreds of steps.
+    A cell forgets with f = σ(b_f); b_f = ln(τ/dt − 1) gives it the time constant τ at rest, and b_i = −b_f
+    keeps its content near one. The plant's hidden lags (about 8 s and 120 s) are then in reach from the first
+    epoch; from torch's default (τ ≈ 0.2 s) the gradient has to find them through hundreds of steps.
     """
     hidden = net.lstm.hidden_size
-    tau_s = torch.logspace(np.log10(shortest_s), np.log10(longest_s), hidden, dtype=net.lstm.bias_ih_l0.dtype)
+    tau_s = torch.logspace(math.log10(shortest_s), math.log10(longest_s), hidden)
     forget = torch.log(tau_s / dt_s - 1.0)
+    parameters = dict(net.lstm.named_parameters())
     with torch.no_grad():
-        net.lstm.bias_hh_l0.zero_()
-        net.lstm.bias_ih_l0[:hidden] = -forget
-        net.lstm.bias_ih_l0[hidden : 2 * hidden] = forget
+        parameters["bias_hh_l0"].zero_()
+        parameters["bias_ih_l0"][:hidden] = -forget
+        parameters["bias_ih_l0"][hidden : 2 * hidden] = forget
 
 
 def weights_document(net: LstmRates, scaling: Scaling, dt_s: float) -> dict:
-    """The net as the weights document (format rt-lstm-weights/1), all numbers exact in float64; gate order i, f, g, o."""
-
-    def matrix(t: torch.Tensor) -> list:
-        return t.detach().to(torch.float64).cpu().numpy().tolist()
-
-    lstm = net.lstm
-    bias = lstm.bias_ih_l0.detach().to(torch.float64) + lstm.bias_hh_l0.detach().to(torch.float64)
+    """The net as a weights document (format rt-lstm-weights/1), numbers in float64, gate order i, f, g, o."""
+    values = {name: p.detach().to(torch.float64).numpy() for name, p in net.named_parameters()}
     ports = {
-        "inputs": zip(INPUT_NAMES, scaling.in_offset, scaling.in_scale, strict=True),
-        "outputs": zip(OUTPUT_NAMES, scaling.out_offset, scaling.out_scale, strict=True),
+        "inputs": zip(INPUTS, scaling.in_offset, scaling.in_scale, strict=True),
+        "outputs": zip(OUTPUTS, scaling.out_offset, scaling.out_scale, strict=True),
     }
     return {
         "format": FORMAT,
         "cell": "lstm",
-        "hidden": lstm.hidden_size,
+        "hidden": net.lstm.hidden_size,
         "layers": 1,
         "gate_order": "ifgo",
         "dt_s": dt_s,
         **{
-            side: [{"name": name, "offset": float(offset), "scale": float(scale)} for name, offset, scale in rows]
+            side: [
+                {"name": name, "offset": float(offset), "scale": float(scale)} for name, offset, scale in rows
+            ]
             for side, rows in ports.items()
         },
-        "W_u": matrix(lstm.weight_ih_l0),
-        "W_h": matrix(lstm.weight_hh_l0),
-        "b": matrix(bias),
-        "W_y": matrix(net.head.weight),
-        "b_y": matrix(net.head.bias),
+        "W_u": values["lstm.weight_ih_l0"].tolist(),
+        "W_h": values["lstm.weight_hh_l0"].tolist(),
+        "b": (values["lstm.bias_ih_l0"] + values["lstm.bias_hh_l0"]).tolist(),
+        "W_y": values["head.weight"].tolist(),
+        "b_y": values["head.bias"].tolist(),
     }
 
 
-def net_from_document(document: dict) -> tuple[LstmRates, Scaling]:
-    """The torch twin of a weights document, in float64 (tests compare it with numpy, CasADi and C)."""
-    net = LstmRates(document["hidden"]).double()
+def net_from_weights(weights: LstmWeights) -> tuple[LstmRates, Scaling]:
+    """The torch twin of a weights file, in float64 (tests compare it with numpy, CasADi and C)."""
+    net = LstmRates(weights.hidden).double()
     values = {
-        "lstm.weight_ih_l0": document["W_u"],
-        "lstm.weight_hh_l0": document["W_h"],
-        "lstm.bias_ih_l0": document["b"],
-        "lstm.bias_hh_l0": np.zeros(4 * document["hidden"]),
-        "head.weight": document["W_y"],
-        "head.bias": document["b_y"],
+        "lstm.weight_ih_l0": weights.w_u,
+        "lstm.weight_hh_l0": weights.w_h,
+        "lstm.bias_ih_l0": weights.b,
+        "lstm.bias_hh_l0": np.zeros(4 * weights.hidden),
+        "head.weight": weights.w_y,
+        "head.bias": weights.b_y,
     }
-    net.load_state_dict({k: torch.tensor(np.asarray(v, dtype=np.float64)) for k, v in values.items()})
-    sides = [np.array([[p["offset"], p["scale"]] for p in document[side]]) for side in ("inputs", "outputs")]
-    return net, Scaling(sides[0][:, 0], sides[0][:, 1], sides[1][:, 0], sides[1][:, 1])
+    net.load_state_dict({name: torch.tensor(value) for name, value in values.items()})
+    return net, Scaling(weights.in_offset, weights.in_scale, weights.out_offset, weights.out_scale)
 
 
 def format_document(document: dict) -> str:
     """Text of a weights document that diffs well: one port, matrix row, vector entry or figure per line.
 
-    Keys of the document keep their order, those of the tables in it are sorted. Floats are written by repr, the shortest
-    text that reads back to the same double, so writing twice gives the same bytes.
+    Keys of the document keep their order, those of the tables in it are sorted. Floats are written by repr,
+    the shortest text that reads back to the same double, so writing twice gives the same bytes.
     """
     items = []
     for key, value in document.items():
