@@ -20,6 +20,14 @@ rt_task_status rt_task_init(rt_task *self, const rt_task_config *config, const r
     return RT_TASK_OK;
 }
 
+rt_task_status rt_task_start_grid(rt_task *self, int64_t t0_ns) {
+    if (self->total.jobs > 0) {
+        return RT_TASK_BAD_CONFIG;
+    }
+    self->config.t0_ns = t0_ns;
+    return RT_TASK_OK;
+}
+
 static int64_t release_of(const rt_task *self, uint64_t index) {
     return self->config.t0_ns + (int64_t)index * self->config.period_ns;
 }

@@ -104,6 +104,9 @@ typedef struct {
 /* Copies `config` and `clock`. RT_TASK_BAD_CONFIG (self untouched) for T <= 0, D outside (0, T] or a missing clock. */
 rt_task_status rt_task_init(rt_task *self, const rt_task_config *config, const rt_clock *clock);
 
+/* Puts r_0 at `t0_ns` before the first job has run; afterwards the grid never moves and RT_TASK_BAD_CONFIG is returned. */
+rt_task_status rt_task_start_grid(rt_task *self, int64_t t0_ns);
+
 /* Sleeps to the next release and opens its job. RT_TASK_INTERRUPTED when a signal came first: nothing has changed, call
  * again or stop. Blocks up to one period. */
 rt_task_status rt_task_wait(rt_task *self, rt_job *job);

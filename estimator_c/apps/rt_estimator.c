@@ -1,0 +1,327 @@
+/* The estimator process: command line, set-up, loop, end. What a cycle does is in est_cycle. */
+#include <errno.h>
+#include <getopt.h>
+#include <signal.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "build_id.h"
+#include "can_port.h"
+#include "est_cycle.h"
+#include "est_lockstep.h"
+#include "est_port.h"
+#include "est_report.h"
+#include "lstm_net.h"
+#include "rt_clock.h"
+#include "rt_grant.h"
+
+enum { MIN_PERIOD_US = 1000, MAX_PERIOD_US = 1000000, DEFAULT_PERIOD_US = 100000, DEFAULT_PRIORITY = 80, MAX_CORE = 1023 };
+enum { MIN_WARMUP_RELEASES = 5, US_PER_S = 1000000 };
+
+typedef struct {
+    const char *bus;
+    const est_setting_t *setting;
+    int64_t period_us;
+    rt_request request;
+    bool lockstep;
+} options;
+
+/* All of the process's large state, out of the stack and locked with the rest. */
+static est_cycle cycle;
+static est_lockstep lockstep;
+static est_port port_state;
+static can_port_t port;
+static rt_stats scratch;
+static volatile sig_atomic_t stop_requested;
+
+static void on_stop(int signal_number) {
+    (void)signal_number;
+    stop_requested = 1;
+}
+
+__attribute__((format(printf, 1, 2))) static int fail(const char *format, ...) {
+    va_list args;
+    va_start(args, format);
+    (void)fputs("rt_estimator: ", stderr);
+    (void)vfprintf(stderr, format, args);
+    (void)fputc('\n', stderr);
+    va_end(args);
+    return EXIT_FAILURE;
+}
+
+static void usage(FILE *out) {
+    (void)fputs("usage: rt_estimator --bus socketcan:IFACE|rt_hub:PATH [--setting NAME] [--period-us 1000..1000000]\n"
+                "                    [--core N] [--priority 1..99] [--no-rt]\n"
+                "       rt_estimator --lockstep [--setting NAME] [--period-us …]   records on stdin and stdout\n",
+                out);
+}
+
+static bool parse_number(const char *text, long low, long high, long *value) {
+    char *end = NULL;
+    errno = 0;
+    *value = strtol(text, &end, 10);
+    return errno == 0 && end != text && *end == '\0' && *value >= low && *value <= high;
+}
+
+static int bad_setting(const char *name) {
+    char known[256] = "";
+    for (size_t i = 0; i < EST_SETTINGS_COUNT; i++) {
+        (void)strncat(known, i > 0 ? ", " : "", sizeof known - strlen(known) - 1);
+        (void)strncat(known, est_settings[i].name, sizeof known - strlen(known) - 1);
+    }
+    return fail("--setting: no setting is called '%s'; compiled in are: %s", name, known);
+}
+
+/* -1: go on; otherwise the exit status. */
+static int parse(int argc, char **argv, options *opt) {
+    static const struct option table[] = {
+        {"bus", required_argument, NULL, 'b'},      {"setting", required_argument, NULL, 's'},
+        {"period-us", required_argument, NULL, 't'}, {"core", required_argument, NULL, 'c'},
+        {"priority", required_argument, NULL, 'p'},  {"no-rt", no_argument, NULL, 'n'},
+        {"lockstep", no_argument, NULL, 'l'},        {"help", no_argument, NULL, 'h'},
+        {NULL, 0, NULL, 0},
+    };
+    const char *setting = "default";
+    long number = 0;
+    int choice = 0;
+    *opt = (options){.period_us = DEFAULT_PERIOD_US, .request = {-1, DEFAULT_PRIORITY, true}};
+    opterr = 0;
+    while ((choice = getopt_long(argc, argv, "", table, NULL)) != -1) {
+        switch (choice) {
+        case 'b':
+            opt->bus = optarg;
+            break;
+        case 's':
+            setting = optarg;
+            break;
+        case 't':
+            if (!parse_number(optarg, MIN_PERIOD_US, MAX_PERIOD_US, &number)) {
+                return fail("--period-us: '%s' is not a period; give %d to %d (1 ms to 1 s)", optarg, MIN_PERIOD_US,
+                            MAX_PERIOD_US);
+            }
+            opt->period_us = number;
+            break;
+        case 'c':
+            if (!parse_number(optarg, 0, MAX_CORE, &number)) {
+                return fail("--core: '%s' is not a core; give 0 to %d", optarg, MAX_CORE);
+            }
+            opt->request.core = (int)number;
+            break;
+        case 'p':
+            if (!parse_number(optarg, 1, 99, &number)) {
+                return fail("--priority: '%s' is not a SCHED_FIFO priority; give 1 to 99", optarg);
+            }
+            opt->request.priority = (int)number;
+            break;
+        case 'n':
+            opt->request.real_time = false;
+            break;
+        case 'l':
+            opt->lockstep = true;
+            break;
+        case 'h':
+            usage(stdout);
+            return EXIT_SUCCESS;
+        default:
+            return fail("%s: unknown option or missing value; see rt_estimator --help", argv[optind - 1]);
+        }
+    }
+    if (optind < argc) {
+        return fail("'%s' is no option; see rt_estimator --help", argv[optind]);
+    }
+    opt->setting = est_setting_find(setting);
+    if (opt->setting == NULL) {
+        return bad_setting(setting);
+    }
+    if (opt->lockstep == (opt->bus != NULL)) {
+        return fail("give either --bus socketcan:IFACE, --bus rt_hub:PATH or --lockstep; see rt_estimator --help");
+    }
+    if (opt->lockstep) {
+        opt->request.real_time = false; /* it waits for its input, not for a clock */
+    }
+    return -1;
+}
+
+static void catch_signals(const options *opt) {
+    struct sigaction ignore;
+    memset(&ignore, 0, sizeof ignore);
+    ignore.sa_handler = SIG_IGN;
+    (void)sigaction(SIGPIPE, &ignore, NULL); /* a reader that left is an error of write, not our death */
+    if (opt->lockstep) {
+        return; /* nothing on a bus to leave in good order: a signal ends the process at once */
+    }
+    struct sigaction stop;
+    memset(&stop, 0, sizeof stop);
+    stop.sa_handler = on_stop; /* no SA_RESTART: the sleep must end */
+    (void)sigaction(SIGTERM, &stop, NULL);
+    (void)sigaction(SIGINT, &stop, NULL);
+}
+
+static est_identity identity_of(const options *opt, const rt_granted *granted) {
+    const est_identity identity = {
+        .dbc_hash = DRIVE_DBC_HASH24,
+        .weights_hash = lstm_weights_hash24,
+        .build_hash = BUILD_HASH24,
+        .setting_id = (uint8_t)opt->setting->id,
+        .policy = (uint8_t)granted->policy,
+        .priority = granted->priority,
+        .core = granted->core,
+        .mlock = granted->mlock,
+        .period_us = opt->period_us,
+    };
+    return identity;
+}
+
+static est_cycle_status set_up(const options *opt, const est_io *io, const rt_granted *granted) {
+    const rt_clock clock = rt_clock_system();
+    const est_identity identity = identity_of(opt, granted);
+    rt_task_config config = {
+        .period_ns = opt->period_us * 1000,
+        .deadline_ns = opt->period_us * 1000,
+        .t0_ns = 0,
+        .warmup_releases = (uint64_t)((US_PER_S + opt->period_us - 1) / opt->period_us),
+        .virtual_time = opt->lockstep,
+    };
+    if (config.warmup_releases < MIN_WARMUP_RELEASES) {
+        config.warmup_releases = MIN_WARMUP_RELEASES;
+    }
+    return est_cycle_init(&cycle, &config, &clock, opt->setting, io, &identity);
+}
+
+static void report_ready(FILE *out, const options *opt, const rt_granted *granted) {
+    const est_report_identity identity = {opt->setting->name, lstm_weights_sha256, DRIVE_DBC_SHA256,
+                                          BUILD_SHA256,       opt->period_us,      granted};
+    est_report_ready(out, &identity);
+}
+
+/* ---- real time ---------------------------------------------------------------------------------------------------- */
+
+static int run_on_bus(const options *opt) {
+    rt_granted granted;
+    est_report_run run = {.stopped_by = "signal"};
+    if (can_port_open(&port, opt->bus) != CAN_PORT_OK) {
+        return fail("%s", port.error);
+    }
+    const est_io io = est_port_io(&port_state, &port);
+    rt_grant_apply(&opt->request, &granted);
+    if (set_up(opt, &io, &granted) != EST_CYCLE_OK) {
+        can_port_close(&port);
+        return fail("setting '%s' does not fit this build; change estimator_c/settings and build again", opt->setting->name);
+    }
+    report_ready(stdout, opt, &granted);
+    rt_environment_read(&run.start, true);
+    est_cycle_start_grid(&cycle);
+
+    est_cycle_status status = EST_CYCLE_OK;
+    while (stop_requested == 0 && status != EST_CYCLE_GONE) {
+        status = est_cycle_wait_and_run(&cycle);
+        if (!run.warm_valid && cycle.task.last_index >= cycle.task.config.warmup_releases) {
+            rt_environment_read(&run.warm, false);
+            run.warm_valid = true;
+        }
+    }
+
+    rt_environment_read(&run.end, true);
+    if (status != EST_CYCLE_GONE) {
+        status = est_cycle_send_final(&cycle);
+    }
+    if (status == EST_CYCLE_GONE) {
+        run.stopped_by = "bus";
+    }
+    est_report_final(stdout, &cycle, &run, &scratch);
+    const int exit_status = status == EST_CYCLE_GONE ? fail("%s", port.error) : EXIT_SUCCESS;
+    can_port_close(&port);
+    return exit_status;
+}
+
+/* ---- lock-step ------------------------------------------------------------------------------------------------------ */
+
+/* Runs the jobs released before `until_ns` (`inclusive`: at it, too). */
+static est_cycle_status run_releases(int64_t until_ns, bool inclusive) {
+    est_cycle_status status = EST_CYCLE_OK;
+    while (status == EST_CYCLE_OK) {
+        const int64_t release_ns = rt_task_next_release_ns(&cycle.task);
+        if (release_ns > until_ns || (release_ns == until_ns && !inclusive)) {
+            break;
+        }
+        status = est_cycle_run_released(&cycle);
+    }
+    return status;
+}
+
+static int bad_input(rt_record_status status) {
+    if (status == RT_RECORD_ERROR) {
+        return fail("stdin: %s; lock-step records are read from it", strerror(errno));
+    }
+    return fail("stdin: the input ended %s an END record; the program that feeds it has stopped",
+                status == RT_RECORD_TRUNCATED ? "inside a record, before" : "without");
+}
+
+/* Handles one record. *done at END. Returns an exit status, or -1 to go on. */
+static int handle(const est_io *io, const rt_record *record, bool *done) {
+    const bool control = record->frame.can_id == RT_RECORD_CONTROL_ID;
+    const uint8_t code = record->frame.data[0];
+    const est_lockstep_status time = est_lockstep_advance(&lockstep, record->t_ns);
+    if (time != EST_LOCKSTEP_OK) {
+        return fail("stdin: record time %s from %lld to %lld ns; records must come in order of time",
+                    time == EST_LOCKSTEP_JUMP ? "leaps" : "goes back", (long long)lockstep.last_ns, (long long)record->t_ns);
+    }
+    est_cycle_status status = run_releases(record->t_ns, control && code == RT_RECORD_TICK);
+    if (status == EST_CYCLE_OK && control && (code == RT_RECORD_TICK || code == RT_RECORD_END)) {
+        if (code == RT_RECORD_END) {
+            io->begin(io->ctx, record->t_ns);
+            status = est_cycle_send_final(&cycle);
+            *done = true;
+        }
+        if (rt_record_control(&lockstep.writer, record->t_ns, code) != RT_RECORD_OK) {
+            status = EST_CYCLE_GONE;
+        }
+    } else if (status == EST_CYCLE_OK) {
+        est_lockstep_push(&lockstep, record);
+    }
+    return status == EST_CYCLE_OK ? -1 : fail("stdout: %s; the program that reads it has stopped", strerror(errno));
+}
+
+static int run_lockstep(const options *opt) {
+    rt_granted granted;
+    est_report_run run = {.stopped_by = "end"};
+    est_lockstep_init(&lockstep, STDIN_FILENO, STDOUT_FILENO);
+    const est_io io = est_lockstep_io(&lockstep);
+    rt_grant_apply(&opt->request, &granted);
+    if (set_up(opt, &io, &granted) != EST_CYCLE_OK) {
+        return fail("setting '%s' does not fit this build; change estimator_c/settings and build again", opt->setting->name);
+    }
+    report_ready(stderr, opt, &granted);
+    rt_environment_read(&run.start, true);
+
+    int exit_status = -1;
+    bool done = false;
+    while (exit_status == -1 && !done) {
+        rt_record record;
+        const rt_record_status status = rt_record_read(&lockstep.reader, &record);
+        exit_status = status == RT_RECORD_OK ? handle(&io, &record, &done) : bad_input(status);
+        if (!run.warm_valid && cycle.task.last_index >= cycle.task.config.warmup_releases) {
+            rt_environment_read(&run.warm, false);
+            run.warm_valid = true;
+        }
+    }
+    rt_environment_read(&run.end, true);
+    if (exit_status != -1) {
+        run.stopped_by = "input";
+    }
+    est_report_final(stderr, &cycle, &run, &scratch);
+    return exit_status == -1 ? EXIT_SUCCESS : exit_status;
+}
+
+int main(int argc, char **argv) {
+    options opt;
+    const int exit_status = parse(argc, argv, &opt);
+    if (exit_status != -1) {
+        return exit_status;
+    }
+    catch_signals(&opt);
+    return opt.lockstep ? run_lockstep(&opt) : run_on_bus(&opt);
+}

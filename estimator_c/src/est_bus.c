@@ -1,0 +1,238 @@
+#include "est_bus.h"
+
+#include <math.h>
+#include <string.h>
+
+static const enum drive_index RX_INDEX[EST_RX_COUNT] = {DRIVE_INDEX_MOTOR_STATE, DRIVE_INDEX_TEMP_MEAS};
+
+static const int64_t NS_PER_MS = 1000000;
+
+void est_bus_init(est_bus *self) {
+    memset(self, 0, sizeof *self);
+    for (int i = 0; i < EST_RX_COUNT; i++) {
+        const drive_message_info_t *info = &drive_messages[RX_INDEX[i]];
+        (void)e2e_receiver_init(&self->rx[i].e2e, info->data_id_list, info->length, info->max_delta);
+    }
+    for (int i = 0; i < DRIVE_MESSAGE_COUNT; i++) {
+        e2e_sender_init(&self->tx[i], drive_messages[i].data_id_list);
+    }
+}
+
+/* ---- receive ---------------------------------------------------------------------------------------------------- */
+
+static bool decode_motor(const struct canfd_frame *frame, est_input *out) {
+    struct drive_motor_state_t raw;
+    if (drive_motor_state_unpack(&raw, frame->data, frame->len) != 0) {
+        return false;
+    }
+    out->id = EST_RX_MOTOR_STATE;
+    out->tick = raw.tick;
+    out->motor.torque_nm = drive_motor_state_torque_nm_to_phys(raw.torque_nm);
+    out->motor.speed_rpm = drive_motor_state_speed_rpm_to_phys(raw.speed_rpm);
+    out->motor.valid = !isnan(out->motor.torque_nm) && !isnan(out->motor.speed_rpm);
+    return true;
+}
+
+static bool decode_temp(const struct canfd_frame *frame, est_input *out) {
+    struct drive_temp_meas_t raw;
+    if (drive_temp_meas_unpack(&raw, frame->data, frame->len) != 0) {
+        return false;
+    }
+    out->id = EST_RX_TEMP_MEAS;
+    out->tick = raw.tick;
+    out->temp.theta_w_degc = drive_temp_meas_theta_w_meas_degc_to_phys(raw.theta_w_meas_degc);
+    out->temp.theta_r_degc = drive_temp_meas_theta_r_meas_degc_to_phys(raw.theta_r_meas_degc);
+    out->temp.valid_w = !isnan(out->temp.theta_w_degc);
+    out->temp.valid_r = !isnan(out->temp.theta_r_degc);
+    return true;
+}
+
+static int listened(canid_t id) {
+    for (int i = 0; i < EST_RX_COUNT; i++) {
+        if (drive_messages[RX_INDEX[i]].can_id == id) {
+            return i;
+        }
+    }
+    return -1;
+}
+
+est_bus_verdict est_bus_accept(est_bus *self, const struct canfd_frame *frame, int64_t at_ns, est_input *out) {
+    const int id = listened(frame->can_id & CAN_EFF_MASK);
+    if (id < 0) {
+        self->foreign++;
+        return EST_BUS_IGNORED;
+    }
+    if ((frame->can_id & (CAN_EFF_FLAG | CAN_RTR_FLAG | CAN_ERR_FLAG)) != 0 || (frame->flags & CANFD_FDF) != 0 ||
+        frame->len > CAN_MAX_DLEN) {
+        self->rejected++;
+        return EST_BUS_IGNORED;
+    }
+    est_rx *rx = &self->rx[id];
+    if (!e2e_is_usable(e2e_check(&rx->e2e, frame->data, frame->len))) {
+        return EST_BUS_IGNORED;
+    }
+    if (!(id == EST_RX_MOTOR_STATE ? decode_motor(frame, out) : decode_temp(frame, out))) {
+        self->rejected++;
+        return EST_BUS_IGNORED;
+    }
+    if (id == EST_RX_MOTOR_STATE ? !out->motor.valid : !(out->temp.valid_w && out->temp.valid_r)) {
+        rx->unavailable++;
+    }
+    if (rx->alive) {
+        rt_stats_add(&rx->gap_ns, at_ns - rx->last_ns, self->accepted);
+    }
+    rx->alive = true;
+    rx->last_ns = at_ns;
+    self->accepted++;
+    return EST_BUS_INPUT;
+}
+
+bool est_bus_stale(est_bus *self, int64_t now_ns, uint64_t index) {
+    bool any = false;
+    for (int i = 0; i < EST_RX_COUNT; i++) {
+        est_rx *rx = &self->rx[i];
+        if (!rx->alive) {
+            continue;
+        }
+        /* A frame that arrived after the snapshot was read in the same job: its age is nil, not negative. */
+        const int64_t age_ns = now_ns > rx->last_ns ? now_ns - rx->last_ns : 0;
+        const bool stale = age_ns > (int64_t)drive_messages[RX_INDEX[i]].timeout_ms * NS_PER_MS;
+        rx->timeouts += stale && !rx->stale ? 1U : 0U;
+        rx->stale = stale;
+        rt_stats_add(&rx->age_ns, age_ns, index);
+        any = any || stale;
+    }
+    return any;
+}
+
+void est_bus_read_faults(const est_bus *self, est_bus_faults *out) {
+    memset(out, 0, sizeof *out);
+    for (int i = 0; i < EST_RX_COUNT; i++) {
+        const uint32_t *counts = self->rx[i].e2e.counts;
+        out->crc_errors += counts[E2E_WRONG_CRC];
+        out->seq_errors += (uint64_t)counts[E2E_REPEATED] + counts[E2E_LOST] + counts[E2E_WRONG_SEQUENCE];
+    }
+    out->rejected = self->rejected;
+}
+
+/* ---- send ------------------------------------------------------------------------------------------------------- */
+
+/* Packs `raw` of message NAME into `frame` and protects it. */
+#define SEAL(self, index, name, raw, frame)                                              \
+    do {                                                                                 \
+        memset((frame), 0, sizeof *(frame));                                             \
+        (frame)->can_id = drive_messages[index].can_id;                                  \
+        (frame)->len = drive_messages[index].length;                                     \
+        (void)drive_##name##_pack((frame)->data, &(raw), sizeof(frame)->data);           \
+        (void)e2e_protect(&(self)->tx[index], (frame)->data, (frame)->len);              \
+    } while (0)
+
+static double us_of(int64_t ns) {
+    return ns < 0 ? (double)NAN : (double)ns * 1e-3;
+}
+
+void est_bus_estimate(est_bus *self, const est_output *in, struct canfd_frame *frame) {
+    struct drive_estimate_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.status = drive_estimate_status_to_raw((double)in->status);
+    raw.theta_w_est_degc = drive_estimate_theta_w_est_degc_to_raw(in->theta_w_degc);
+    raw.theta_r_est_degc = drive_estimate_theta_r_est_degc_to_raw(in->theta_r_degc);
+    raw.tick = in->tick;
+    SEAL(self, DRIVE_INDEX_ESTIMATE, estimate, raw, frame);
+}
+
+void est_bus_innov(est_bus *self, const est_output *in, struct canfd_frame *frame) {
+    struct drive_estimate_innov_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.sweeps = drive_estimate_innov_sweeps_to_raw((double)in->sweeps);
+    raw.innov_w_degc = drive_estimate_innov_innov_w_degc_to_raw(in->innov_w_degc);
+    raw.innov_r_degc = drive_estimate_innov_innov_r_degc_to_raw(in->innov_r_degc);
+    raw.tick = in->tick;
+    SEAL(self, DRIVE_INDEX_ESTIMATE_INNOV, estimate_innov, raw, frame);
+}
+
+void est_bus_timing_a(est_bus *self, const est_timing *in, struct canfd_frame *frame) {
+    struct drive_est_timing_a_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.miss_late = in->miss_late ? 1U : 0U;
+    raw.warmup = in->warmup ? 1U : 0U;
+    raw.stale_input = in->stale_input ? 1U : 0U;
+    raw.after_skip = in->after_skip ? 1U : 0U;
+    raw.release_index = drive_est_timing_a_release_index_to_raw((double)in->release_index);
+    raw.wake_lat_us = drive_est_timing_a_wake_lat_us_to_raw(us_of(in->wake_lat_ns));
+    SEAL(self, DRIVE_INDEX_EST_TIMING_A, est_timing_a, raw, frame);
+}
+
+void est_bus_timing_b(est_bus *self, const est_timing *in, struct canfd_frame *frame) {
+    struct drive_est_timing_b_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.miss_cause = drive_est_timing_b_miss_cause_to_raw((double)in->miss_cause);
+    raw.exec_wall_us = drive_est_timing_b_exec_wall_us_to_raw(us_of(in->exec_wall_ns));
+    raw.resp_us = drive_est_timing_b_resp_us_to_raw(us_of(in->resp_ns));
+    SEAL(self, DRIVE_INDEX_EST_TIMING_B, est_timing_b, raw, frame);
+}
+
+static void releases(est_bus *self, const est_counters *in, struct canfd_frame *frame) {
+    struct drive_est_releases_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.releases = drive_est_releases_releases_to_raw((double)in->releases);
+    raw.jobs = drive_est_releases_jobs_to_raw((double)in->jobs);
+    SEAL(self, DRIVE_INDEX_EST_RELEASES, est_releases, raw, frame);
+}
+
+static void misses(est_bus *self, const est_counters *in, struct canfd_frame *frame) {
+    struct drive_est_misses_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.miss_late = drive_est_misses_miss_late_to_raw((double)in->miss_late);
+    raw.miss_skipped = drive_est_misses_miss_skipped_to_raw((double)in->miss_skipped);
+    raw.overrun = drive_est_misses_overrun_to_raw((double)in->overrun);
+    SEAL(self, DRIVE_INDEX_EST_MISSES, est_misses, raw, frame);
+}
+
+static void input_faults(est_bus *self, const est_counters *in, struct canfd_frame *frame) {
+    struct drive_est_input_faults_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.crc_errors = drive_est_input_faults_crc_errors_to_raw((double)in->crc_errors);
+    raw.seq_errors = drive_est_input_faults_seq_errors_to_raw((double)in->seq_errors);
+    raw.stale_inputs = drive_est_input_faults_stale_inputs_to_raw((double)in->stale_inputs);
+    SEAL(self, DRIVE_INDEX_EST_INPUT_FAULTS, est_input_faults, raw, frame);
+}
+
+static void bus_faults(est_bus *self, const est_counters *in, struct canfd_frame *frame) {
+    struct drive_est_bus_faults_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.rx_drops = drive_est_bus_faults_rx_drops_to_raw((double)in->rx_drops);
+    raw.tx_drops = drive_est_bus_faults_tx_drops_to_raw((double)in->tx_drops);
+    raw.rejected = drive_est_bus_faults_rejected_to_raw((double)in->rejected);
+    SEAL(self, DRIVE_INDEX_EST_BUS_FAULTS, est_bus_faults, raw, frame);
+}
+
+void est_bus_counters(est_bus *self, const est_counters *in, struct canfd_frame frames[EST_COUNTER_FRAMES]) {
+    releases(self, in, &frames[0]);
+    misses(self, in, &frames[1]);
+    input_faults(self, in, &frames[2]);
+    bus_faults(self, in, &frames[3]);
+}
+
+void est_bus_identity(est_bus *self, const est_identity *in, struct canfd_frame frames[EST_IDENTITY_FRAMES]) {
+    struct drive_est_identity_t identity;
+    memset(&identity, 0, sizeof identity);
+    identity.dbc_hash = drive_est_identity_dbc_hash_to_raw((double)in->dbc_hash);
+    identity.weights_hash = drive_est_identity_weights_hash_to_raw((double)in->weights_hash);
+    SEAL(self, DRIVE_INDEX_EST_IDENTITY, est_identity, identity, &frames[0]);
+
+    struct drive_est_build_t build;
+    memset(&build, 0, sizeof build);
+    build.build_hash = drive_est_build_build_hash_to_raw((double)in->build_hash);
+    build.setting_id = drive_est_build_setting_id_to_raw((double)in->setting_id);
+    SEAL(self, DRIVE_INDEX_EST_BUILD, est_build, build, &frames[1]);
+
+    struct drive_est_granted_t granted;
+    memset(&granted, 0, sizeof granted);
+    granted.policy = drive_est_granted_policy_to_raw((double)in->policy);
+    granted.priority = drive_est_granted_priority_to_raw((double)in->priority);
+    granted.core = drive_est_granted_core_to_raw(in->core < 0 ? (double)NAN : (double)in->core);
+    granted.mlock = in->mlock ? 1U : 0U;
+    granted.period_us = drive_est_granted_period_us_to_raw((double)in->period_us);
+    SEAL(self, DRIVE_INDEX_EST_GRANTED, est_granted, granted, &frames[2]);
+}

@@ -1,0 +1,64 @@
+/* One cycle of the estimator process, the same in real time and in lock-step: read, check, estimate, publish, account.
+ *
+ *     frames → est_bus (E2E, decode) → estimator → est_bus (encode, E2E) → frames
+ *
+ * Frames leave in this order: Estimate, EstimateInnov, then (response time known) EstTimingA, EstTimingB; once a second
+ * of release time the four counter frames; with the first job and every ten seconds the three identity frames.
+ * No allocation, no lock, no printing. One thread; the caller owns the object. */
+#ifndef EST_CYCLE_H
+#define EST_CYCLE_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "est_bus.h"
+#include "est_io.h"
+#include "estimator.h"
+#include "rt_task.h"
+
+enum { EST_CYCLE_MAX_FRAMES = 4096 }; /* frames one job reads at most; the rest waits for the next job */
+
+typedef enum {
+    EST_CYCLE_OK = 0,
+    EST_CYCLE_GONE = 1,         /* the bus has ended */
+    EST_CYCLE_INTERRUPTED = 2,  /* a signal ended the wait */
+    EST_CYCLE_BAD_SETTING = 3,
+    EST_CYCLE_BAD_PERIOD = 4
+} est_cycle_status;
+
+/* About 400 kB: belongs in static storage. */
+typedef struct {
+    rt_task task;
+    est_bus bus;
+    estimator_t estimator;
+    est_io io;
+    est_identity identity;
+    int64_t next_counters_ns;   /* release time from which the counters are due */
+    int64_t next_identity_ns;
+    uint64_t stale_jobs;        /* jobs made without fresh input */
+    uint64_t estimates_sent;    /* jobs = estimates_sent + estimates_lost */
+    uint64_t estimates_lost;
+    uint64_t status_jobs[16];   /* jobs by published status */
+} est_cycle;
+
+/* Prepares everything and runs the whole estimator once through a made-up drive of its own, so that the first real job
+ * finds code and data in memory. Copies all arguments; what `io.ctx` points to must outlive `self`. Milliseconds. */
+est_cycle_status est_cycle_init(est_cycle *self, const rt_task_config *config, const rt_clock *clock,
+                                const est_setting_t *setting, const est_io *io, const est_identity *identity);
+
+/* Real time: the grid starts now (r_0), so that set-up time is no release. Once, before the first job. */
+void est_cycle_start_grid(est_cycle *self);
+
+/* Real time: waits for the next release and runs its job. Blocks up to one period. */
+est_cycle_status est_cycle_wait_and_run(est_cycle *self);
+
+/* Lock-step: runs the job of the next release, whose time is rt_task_next_release_ns. */
+est_cycle_status est_cycle_run_released(est_cycle *self);
+
+/* The counters as they are published. O(1). */
+void est_cycle_counters(const est_cycle *self, est_counters *out);
+
+/* Sends the four counter frames once more, after the last job. */
+est_cycle_status est_cycle_send_final(est_cycle *self);
+
+#endif

@@ -1,0 +1,35 @@
+/* What the estimator's cycle needs of a bus: frames in with their arrival time, frames out, and the losses.
+ *
+ * Two implementations: est_port (a real bus) and est_lockstep (records over pipes). None blocks or allocates. */
+#ifndef EST_IO_H
+#define EST_IO_H
+
+#include <linux/can.h>
+#include <stdint.h>
+
+typedef enum {
+    EST_IO_OK = 0,
+    EST_IO_EMPTY = 1, /* recv: nothing more now */
+    EST_IO_FULL = 2,  /* send: no room; the frame is lost and counted in tx_drops */
+    EST_IO_GONE = 3   /* the bus has ended */
+} est_io_status;
+
+typedef struct {
+    uint64_t received;
+    uint64_t sent;
+    uint64_t rx_drops;
+    uint64_t tx_drops;
+    uint64_t rejected;
+} est_io_counters;
+
+typedef struct {
+    void *ctx;
+    /* A job begins at `now_ns` (the task's time base). */
+    void (*begin)(void *ctx, int64_t now_ns);
+    /* The oldest frame not yet read and when it arrived, in the task's time base. */
+    est_io_status (*recv)(void *ctx, struct canfd_frame *frame, int64_t *at_ns);
+    est_io_status (*send)(void *ctx, const struct canfd_frame *frame);
+    void (*counters)(void *ctx, est_io_counters *out);
+} est_io;
+
+#endif

@@ -1,0 +1,68 @@
+#include "est_port.h"
+
+#include <stddef.h>
+
+#include "drive_e2e.h"
+#include "rt_clock.h"
+
+static void begin(void *ctx, int64_t now_ns) {
+    est_port *self = ctx;
+    self->drained_ns = self->now_ns;
+    self->now_ns = now_ns;
+    self->offset_ns = rt_clock_realtime_ns() - now_ns;
+}
+
+static est_io_status status_of(can_port_status_t status) {
+    switch (status) {
+    case CAN_PORT_OK:
+        return EST_IO_OK;
+    case CAN_PORT_EMPTY:
+        return EST_IO_EMPTY;
+    case CAN_PORT_FULL:
+    case CAN_PORT_REFUSED: /* no frame of ours is, but a lost frame is what it would be */
+        return EST_IO_FULL;
+    case CAN_PORT_GONE:
+        break;
+    }
+    return EST_IO_GONE;
+}
+
+static est_io_status receive(void *ctx, struct canfd_frame *frame, int64_t *at_ns) {
+    est_port *self = ctx;
+    int64_t rx_ns = 0;
+    const est_io_status status = status_of(can_port_recv(self->port, frame, &rx_ns));
+    /* The wall clock may have been set between stamp and now; but the frame cannot be older than the last look. */
+    const int64_t at = rx_ns - self->offset_ns;
+    *at_ns = at < self->drained_ns ? self->drained_ns : at;
+    return status;
+}
+
+static est_io_status transmit(void *ctx, const struct canfd_frame *frame) {
+    return status_of(can_port_send(((est_port *)ctx)->port, frame));
+}
+
+static void counters(void *ctx, est_io_counters *out) {
+    const can_port_counters_t *from = &((const est_port *)ctx)->port->counters;
+    out->received = from->received;
+    out->sent = from->sent;
+    out->rx_drops = from->rx_drops;
+    out->tx_drops = from->tx_drops;
+    out->rejected = from->rejected;
+}
+
+est_io est_port_io(est_port *self, can_port_t *port) {
+    self->port = port;
+    self->offset_ns = 0;
+    self->now_ns = 0;
+    self->drained_ns = 0;
+    if (!port->hub) {
+        /* On the hub every frame is read anyway: the port would filter here, after the system call. */
+        const struct can_filter wanted[] = {
+            {drive_messages[DRIVE_INDEX_MOTOR_STATE].can_id, CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG},
+            {drive_messages[DRIVE_INDEX_TEMP_MEAS].can_id, CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG},
+        };
+        (void)can_port_filter(port, wanted, sizeof wanted / sizeof wanted[0]);
+    }
+    const est_io io = {self, begin, receive, transmit, counters};
+    return io;
+}
