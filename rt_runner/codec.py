@@ -1,7 +1,7 @@
 """Between physical values in SI-style units and protected frames; everything it knows comes from the DBC.
 
-cantools packs and unpacks the bits; scaling, clamping and "not available" are done here by one stated rule, the
-same the generated C follows, because cantools raises on what is out of range and rounds ties the other way.
+cantools packs and unpacks the bits; scaling, clamping and "not available" are done here by one stated rule,
+the same the generated C follows, because cantools raises on what is out of range and rounds ties the other way.
 """
 
 import math
@@ -110,7 +110,7 @@ class Decoder:
         status = check.check(data)
         if status is E2eStatus.WRONG_CRC:
             return Decoded(message.name, dict.fromkeys(s[0] for s in signals), status)
-        raw = message.codec.decode(data, decode_choices=False, scaling=False)
+        raw: dict = message.codec.decode(data, decode_choices=False, scaling=False)  # type: ignore[assignment]
         values = {name: None if raw[name] == na else raw[name] * f + o for name, na, f, o in signals}
         return Decoded(message.name, values, status)
 

@@ -1,8 +1,8 @@
 """Writes the C side of the DBC: ``python -m rt_runner.codegen --dbc dbc/drive.dbc --out DIR``.
 
-``drive.c`` / ``drive.h`` come from cantools (pack, unpack, choices). ``drive_e2e.c`` / ``drive_e2e.h`` add what
-cantools leaves out: a table of ids, cycle times, timeouts and data ids, and conversions that are safe for every
-double (cantools' encode is undefined out of range). The same DBC gives the same bytes, whenever it is run.
+``drive.c`` / ``drive.h`` come from cantools (pack, unpack, choices). ``drive_e2e.c`` / ``drive_e2e.h`` add
+what cantools leaves out: a table of ids, cycle times, timeouts and data ids, and conversions that are safe for
+every double (cantools' encode is undefined out of range). The same DBC gives the same bytes, whenever it is run.
 """
 
 import argparse
@@ -121,7 +121,7 @@ def generate(dbc: Dbc) -> dict[str, str]:
         dbc.database, NAME, f"{NAME}.h", f"{NAME}.c", f"{NAME}_fuzzer.c", use_round=True
     )
     if "round(" not in source:
-        raise SetupError("cantools generates truncating C code: it is too old, install cantools 45.1 or newer")
+        raise SetupError("cantools generates truncating C code: install cantools 45.1 or newer")
     return {
         f"{NAME}.h": _DATED.sub(r"\1.", header),
         f"{NAME}.c": _DATED.sub(r"\1.", source),
@@ -131,7 +131,7 @@ def generate(dbc: Dbc) -> dict[str, str]:
 
 
 def write(dbc: Dbc, out: Path) -> list[Path]:
-    """Write the files into ``out``; one that would not change keeps its time stamp. Returns the changed ones."""
+    """Write the files into ``out``; one that would not change keeps its time stamp. Returns the others."""
     changed = []
     out.mkdir(parents=True, exist_ok=True)
     for name, text in generate(dbc).items():
@@ -212,7 +212,7 @@ def _row(m: MessageInfo) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="rt_runner.codegen", description="Generate the C codec from the DBC.")
+    parser = argparse.ArgumentParser(prog="rt_runner.codegen", description="Write the C codec of a DBC.")
     parser.add_argument("--dbc", default=None, metavar="FILE", help="default: the project's own")
     parser.add_argument("--out", required=True, metavar="DIR", type=Path, help="made if it does not exist")
     args = parser.parse_args(argv)
@@ -220,7 +220,8 @@ def main(argv: list[str] | None = None) -> int:
         dbc = load_dbc(args.dbc)
         findings = lint(dbc.text)
         if findings:  # refused here, before a frame with two meanings is compiled into anything
-            raise SetupError(f"{dbc.path}: {findings[0]}; python -m rt_runner.lint_dbc lists all {len(findings)}")
+            rest = f"; python -m rt_runner.lint_dbc lists all {len(findings)}"
+            raise SetupError(f"{dbc.path}: {findings[0]}{rest}")
         write(dbc, args.out)
     except RtError as e:
         print(f"codegen: {e}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""The DBC as the rest of the project sees it: cantools' database plus what our attributes say about each frame."""
+"""The DBC as the project sees it: cantools' database plus what our attributes say about each frame."""
 
 import hashlib
 from collections.abc import Iterator
@@ -80,7 +80,7 @@ class MessageInfo:
 
     @property
     def max_delta(self) -> int:
-        """Largest counter step still taken as "some lost": what fits into the timeout, at least 1, at most 14."""
+        """Largest counter step still taken as "some lost": what fits into the timeout, 1 to 14."""
         return max(1, min(COUNTER_STATES - 2, self.timeout_ms // self.cycle_ms))
 
     @property
@@ -90,7 +90,7 @@ class MessageInfo:
 
 
 class Dbc:
-    """A loaded DBC: ``dbc["Estimate"]`` by name, ``dbc.by_id`` by CAN id, iteration in the order of the file."""
+    """A loaded DBC: ``dbc["Estimate"]`` by name, ``dbc.by_id`` by CAN id, iterated in the order of the file."""
 
     def __init__(self, database: Database, text: bytes, path: str) -> None:
         self.database = database
@@ -144,7 +144,7 @@ def parse_dbc(text: bytes, path: str = "DBC") -> Dbc:
     return Dbc(database, text, path)
 
 
-def _attribute(message: Message, name: str, path: str) -> str | int:
+def _attribute(message: Message, name: str, path: str) -> str | int | float:
     attributes = message.dbc.attributes if message.dbc is not None else {}
     if name not in attributes:
         raise DbcError(f"{path}: message {message.name} has no attribute {name}; add a BA_ line for it")
@@ -166,7 +166,7 @@ def _message_info(message: Message, path: str) -> MessageInfo:
         ids = b""
     if len(ids) != COUNTER_STATES:
         raise DbcError(
-            f"{path}: message {message.name}: HilDataIdList {text!r} is not {COUNTER_STATES} bytes in hexadecimal"
+            f"{path}: message {message.name}: HilDataIdList {text!r} is not {COUNTER_STATES} bytes in hex"
         )
     crc, counter = (str(_attribute(message, f"Hil{s}Signal", path)) for s in ("Crc", "Counter"))
     places = {s.name: (s.start, s.length) for s in message.signals if s.byte_order == "little_endian"}

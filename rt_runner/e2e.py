@@ -1,10 +1,11 @@
 """AUTOSAR end-to-end protection, profile 2: CRC-8H2F over bytes 1.. and a data id, a 4-bit counter.
 
-Layout of a protected frame: byte 0 the CRC, byte 1 low nibble the counter. The data id of a frame is the entry
-of its message's 16-entry list at the frame's counter value; it is never sent. `estimator_c/src/e2e.c` is the twin.
+Layout of a protected frame: byte 0 the CRC, byte 1 low nibble the counter. The data id of a frame is the
+entry of its message's 16-entry list at the frame's counter value; it is never sent. The twin in C is
+`estimator_c/src/e2e.c`.
 
 Received frames are judged like in AUTOSAR's check function, driven by arrival: the first good frame starts the
-sequence, a repeat does not move it, after a jump beyond ``max_delta`` the sequence restarts at the frame received.
+sequence, a repeat does not move it, after a jump beyond ``max_delta`` it restarts at the frame received.
 """
 
 from enum import IntEnum
@@ -37,7 +38,7 @@ _CRC8H2F = _table()
 
 
 def crc8h2f(data: bytes) -> int:
-    """CRC-8 with polynomial 0x2F, start value 0xFF, result inverted (AUTOSAR CRC library, "0x2F polynomial")."""
+    """CRC-8 with polynomial 0x2F, start value 0xFF, result inverted (AUTOSAR's CRC library: CRC-8H2F)."""
     crc = 0xFF
     table = _CRC8H2F
     for byte in data:

@@ -16,14 +16,18 @@ from cantools.database.can import Database, Message, Signal
 from cantools.database.can.c_source import camel_to_snake_case
 
 from rt_runner.dbc import COUNTER_STATES, NOT_AVAILABLE, DbcError, raw_limits
+from rt_runner.e2e import crc8h2f
 
 C_KEYWORDS = frozenset(
-    "auto break case char const continue default do double else enum extern float for goto if inline int long "
-    "register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while "
-    "bool true false asm class new delete this template namespace private public protected virtual".split()
+    (
+        "auto break case char const continue default do double else enum extern float for goto if inline int "
+        "long register restrict return short signed sizeof static struct switch typedef union unsigned void "
+        "volatile while bool true false asm class new delete this template namespace private public protected"
+    ).split()  # noqa: SIM905 - a list of this length is no easier to read
 )
 UNIT_OF_SUFFIX = {
-    "nm": "Nm", "rpm": "rpm", "degc": "degC", "mps": "m/s", "rad": "rad", "us": "us", "ms": "ms", "m": "m", "s": "s",
+    "nm": "Nm", "rpm": "rpm", "degc": "degC", "mps": "m/s", "rad": "rad",
+    "us": "us", "ms": "ms", "m": "m", "s": "s",
 }  # fmt: skip
 CLASSIC_BYTES = 8
 STANDARD_IDS = 0x800
@@ -75,7 +79,7 @@ def _signals(db: Database) -> Iterator[tuple[str, Message, Signal]]:
     return ((f"{m.name}.{s.name}", m, s) for m in db.messages for s in m.signals)
 
 
-def _attribute(message: Message, name: str) -> str | int | None:
+def _attribute(message: Message, name: str) -> str | int | float | None:
     attributes = message.dbc.attributes if message.dbc is not None else {}
     return attributes[name].value if name in attributes else None
 
@@ -140,9 +144,10 @@ def limits(db: Database) -> Iterator[tuple[str, str]]:
         if s.minimum is not None and s.maximum is not None and s.minimum > s.maximum:
             yield where, f"minimum {s.minimum:g} is above maximum {s.maximum:g}"
         na = _na(s)
-        if na is not None and s.minimum is not None and s.maximum is not None:
-            if s.minimum - slack < na * s.scale + s.offset < s.maximum + slack:
-                yield where, "the not-available code lies between minimum and maximum, it would be a valid value"
+        if na is None or s.minimum is None or s.maximum is None:
+            continue
+        if s.minimum - slack < na * s.scale + s.offset < s.maximum + slack:
+            yield where, "the not-available code lies between minimum and maximum, it would be a valid value"
 
 
 @_rule
@@ -190,7 +195,7 @@ def cycle_time(db: Database) -> Iterator[tuple[str, str]]:
             if not value:
                 yield m.name, f"{name} is missing or 0"
         if cycle and timeout and int(timeout) < int(cycle):
-            yield m.name, f"timeout {timeout} ms is shorter than the cycle of {cycle} ms: it would always be stale"
+            yield m.name, f"timeout {timeout} ms is shorter than the cycle of {cycle} ms: always stale"
 
 
 @_rule
@@ -262,7 +267,7 @@ def protection(db: Database) -> Iterator[tuple[str, str]]:
             if found is None:
                 yield m.name, f"{attribute} is missing or names no signal of the frame"
             elif (found.start, found.length, found.is_signed) != (start, bits, False):
-                yield m.name, f"{attribute} {name} must be {bits} unsigned bits at bit {start} (E2E profile 2)"
+                yield m.name, f"{attribute} {name} must be {bits} unsigned bits at bit {start} (profile 2)"
 
 
 @_rule
@@ -278,6 +283,10 @@ def data_ids(db: Database) -> Iterator[tuple[str, str]]:
             yield m.name, f"HilDataIdList must be {COUNTER_STATES} bytes in hexadecimal"
         else:
             lists[m.name] = ids
+            # The counter picks the data id, so damage to the counter can cancel itself out of the CRC.
+            crcs = [crc8h2f(bytes((c, *bytes(m.length - 2), ids[c]))) for c in range(COUNTER_STATES)]
+            if len(set(crcs)) < COUNTER_STATES:
+                yield m.name, "HilDataIdList lets one counter value turn into another without a wrong CRC"
     for (a, ids_a), (b, ids_b) in combinations(lists.items(), 2):
         same = [c for c in range(COUNTER_STATES) if ids_a[c] == ids_b[c]]
         if same:
@@ -293,13 +302,13 @@ def truth(db: Database) -> Iterator[tuple[str, str]]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="rt_runner.lint_dbc", description="Check a DBC beyond cantools' strict mode.")
+    parser = argparse.ArgumentParser(prog="rt_runner.lint_dbc", description="Check a DBC beyond cantools' own.")
     parser.add_argument("dbc", type=Path, metavar="FILE")
     path = parser.parse_args(argv).dbc
     try:
         findings = lint(path.read_bytes())
     except OSError as e:
-        print(f"lint_dbc: {path}: cannot read it ({e.strerror}); give the path of a DBC file", file=sys.stderr)
+        print(f"lint_dbc: {path}: cannot read it ({e.strerror}); give a DBC file", file=sys.stderr)
         return 1
     except DbcError as e:
         print(f"lint_dbc: {path}: {e}", file=sys.stderr)

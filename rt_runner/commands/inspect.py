@@ -1,0 +1,26 @@
+"""``rt-runner inspect``: what is in a log."""
+
+
+def add_parser(subparsers) -> None:
+    """Add the verb."""
+    p = subparsers.add_parser(
+        "inspect",
+        help="what is in a log: frames, rates, gaps, verdict",
+        description="Show what is in a log, finished or not: frames, rates against the DBC, gaps, damage, verdict.",
+    )
+    p.add_argument("log", metavar="LOG", help="an .mcap file")
+    p.add_argument("--json", metavar="FILE", help="write the figures as JSON (- for standard output)")
+    p.set_defaults(run=run)
+
+
+def run(args) -> int:
+    """Print it; returns 0 whatever the log's verdict is, 1 (by exception) if it cannot be read."""
+    from rt_runner.inspect import as_json, show
+    from rt_runner.log_summary import summarise
+    from rt_runner.present import write_json
+
+    summary = summarise(args.log)
+    write_json(as_json(summary), args.json)
+    if args.json != "-":
+        show(summary)
+    return 0
