@@ -12,9 +12,9 @@ from tools.report.series import decimate, log_histogram
 
 MAX_POINTS = 8000  # per series: over three for each pixel of a wide screen, so a little zoom is still sharp
 MAX_MARKS = 4000
-ZERO_COUNT = 0.6  # where an empty bin is drawn on the log axis: under one count
+COUNT_FLOOR = 0.6  # a log axis has no zero: it starts under one count,
+ZERO_COUNT = 0.3  # and empty bins lie below it, out of sight
 T_UNIT_S = 1e-4
-STATUS_OK = 2
 
 
 def build_charts(data: ReportData) -> list[dict[str, Any]]:
@@ -45,8 +45,9 @@ def _time_axis(data: ReportData) -> dict[str, Any]:
     return {"label": "time since start of the log (s)", "log": False, "range": time_range(data)}
 
 
-def _spans(data: ReportData) -> list[dict[str, Any]]:
-    return [{"t0": round(s.start_s, 3), "t1": round(s.end_s, 3), "label": s.label, "kind": s.kind} for s in data.spans]
+def _spans(data: ReportData, kinds: tuple[str, ...] = ("unjudged", "status")) -> list[dict[str, Any]]:
+    spans = [s for s in data.spans if s.kind in kinds]
+    return [{"t0": round(s.start_s, 3), "t1": round(s.end_s, 3), "label": s.label, "kind": s.kind} for s in spans]
 
 
 def encode(trace: Trace, digits: int, max_points: int = MAX_POINTS) -> dict[str, Any]:
@@ -97,7 +98,8 @@ def _error_chart(name: str, title: str, node: Temperature, data: ReportData) -> 
 
 def _drive_chart(data: ReportData) -> dict[str, Any]:
     return {
-        "id": "drive", "title": "Torque and speed", "height": 210, "x": _time_axis(data), "spans": _spans(data),
+        "id": "drive", "title": "Torque and speed", "height": 210, "x": _time_axis(data),
+        "spans": _spans(data, ("status",)),
         "note": _decimation_note(data.torque),
         "y": [
             {"scale": "nm", "label": "torque (N·m)", "unit": "N·m", "zero": True, "min_span": 1.0, "colour": "--torque"},
@@ -114,7 +116,8 @@ def _decimation_note(trace: Trace) -> str:
     if trace.t_s.size <= MAX_POINTS:
         return ""
     bucket_ms = (trace.t_s[-1] - trace.t_s[0]) / (MAX_POINTS // 2) * 1e3
-    return f"{trace.t_s.size:,} samples, drawn as lowest and highest of each {bucket_ms:.0f} ms".replace(",", "\u202f")
+    count = f"{trace.t_s.size:,}".replace(",", "\u202f")
+    return f"{count} samples, drawn as lowest and highest of each {bucket_ms:.0f} ms"
 
 
 def _deadline(data: ReportData, scale: str) -> list[dict[str, Any]]:
@@ -158,7 +161,7 @@ def _histogram_chart(data: ReportData) -> dict[str, Any]:
         "id": "histogram", "title": "Timing histogram", "height": 280, "note": note, "lines": deadline,
         "x": {"label": "time from the intended release; execution: duration of the step", "log": True,
               "range": [float(span[0]), float(span[1])]},
-        "y": [{"scale": "n", "label": "jobs per bin", "unit": "", "log": True, "floor": ZERO_COUNT}],
+        "y": [{"scale": "n", "label": "jobs per bin", "unit": "", "log": True, "floor": COUNT_FLOOR}],
         "series": series,
     }
 
@@ -168,7 +171,7 @@ def _response_chart(data: ReportData) -> dict[str, Any]:
     for label, values, colour, _ in _timing_series(data):
         if label == "wake latency":
             continue
-        series += _line(Trace(jobs.t_s, values), label, "µs", "us", colour, 1, width=1.1)
+        series += _line(Trace(jobs.t_s, values), label, "µs", "us", colour, 1, style="dots", width=1)
     marks = [
         ("late", "--miss", False, jobs.t_s[jobs.late], jobs.resp_us[jobs.late]),
         ("skipped", "--skip", True, jobs.skipped_t_s, _at_deadline(jobs, data.period_s)),
@@ -187,7 +190,8 @@ def _response_chart(data: ReportData) -> dict[str, Any]:
     else:
         title, note = "Response time over time", "skipped activations never ran: drawn on the deadline"
     return {
-        "id": "response", "title": title, "height": 220, "x": _time_axis(data), "spans": _spans(data),
+        "id": "response", "title": title, "height": 220, "x": _time_axis(data),
+        "spans": _spans(data, ("status",)),
         "note": "; ".join([note, *notes]), "lines": _deadline(data, "us"),
         "y": [{"scale": "us", "label": "time", "unit": "µs", "log": True}], "series": series,
     }

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from rt_runner.result import CAUSES, RELEASE_BITS, SETTLE_S, STATUS_SHOWN, TICK_S
-from tools.report.data import Array, FrameStat, Jobs, Span, Temperature, Trace
+from tools.report.data import Array, Jobs, Span, Temperature, Trace
 from tools.report.series import error_against_truth, time_of_tick, unwrap_ticks, with_gaps
 
-REPEATED, LOST, WRONG_SEQUENCE, WRONG_CRC = 1, 2, 3, 4
+WRONG_CRC = 4
 STATUS_INIT, STATUS_STARTING, STATUS_OK = 0, 1, 2
 RELEASE_MODULUS = 1 << RELEASE_BITS
 TRUTH_REACH_TICKS = 100.0  # as the runner's result: a second without truth is a hole
@@ -25,22 +24,14 @@ WANTED = {
     "EstTimingA": ("release_index", "wake_lat_us", "miss_late", "warmup"),
     "EstTimingB": ("exec_wall_us", "resp_us", "miss_cause"),
 }
-KEPT_LAST = ("EstIdentity", "EstBuild", "EstGranted", "PlantIdentity", "EstInputFaults", "EstBusFaults", "PlantStatus")
-
-
-@dataclass
-class Reception:
-    """Arrival times and end-to-end faults of one message."""
-
-    t_ns: list[int] = field(default_factory=list)
-    faults: dict[int, int] = field(default_factory=dict)
+KEPT_LAST = ("EstIdentity", "EstBuild", "EstGranted", "PlantIdentity")
 
 
 class Collector:
     """Fed every decoded frame in log order; afterwards turns its columns into the report's signals."""
 
     def __init__(self) -> None:
-        self.receptions: dict[str, Reception] = {}
+        self.first_ns: int | None = None
         self.last: dict[str, dict[str, float | None]] = {}
         self._rows: dict[str, list[tuple[float | None, ...]]] = {name: [] for name in WANTED}
         self._t_ns: dict[str, list[int]] = {name: [] for name in WANTED}
@@ -48,11 +39,8 @@ class Collector:
         self._ticks: list[int] = []
 
     def feed(self, t_ns: int, name: str, values: dict[str, float | None], e2e: int) -> None:
-        """Take one frame: its reception always counts, its values only if its CRC is right."""
-        reception = self.receptions.setdefault(name, Reception())
-        reception.t_ns.append(t_ns)
-        if e2e:
-            reception.faults[e2e] = reception.faults.get(e2e, 0) + 1
+        """Take one frame; a damaged one says nothing."""
+        self.first_ns = t_ns if self.first_ns is None else min(self.first_ns, t_ns)
         if e2e == WRONG_CRC:
             return
         if name in KEPT_LAST:
@@ -70,20 +58,10 @@ class Collector:
         self._t_ns[name].append(t_ns)
 
     # ---- columns --------------------------------------------------------------------------------------
-    @property
-    def first_ns(self) -> int:
-        """Stamp of the earliest frame, 0 for an empty log."""
-        return min((r.t_ns[0] for r in self.receptions.values()), default=0)
-
-    @property
-    def last_ns(self) -> int:
-        """Stamp of the latest frame, 0 for an empty log."""
-        return max((r.t_ns[-1] for r in self.receptions.values()), default=0)
-
     def _columns(self, name: str) -> dict[str, Array]:
         table = np.array(self._rows[name], dtype=float).reshape(-1, len(WANTED[name]))
         columns = dict(zip(WANTED[name], table.T, strict=True))
-        columns["t_s"] = (np.array(self._t_ns[name], dtype=np.int64) - self.first_ns) / 1e9
+        columns["t_s"] = (np.array(self._t_ns[name], dtype=np.int64) - (self.first_ns or 0)) / 1e9
         return columns
 
     def columns(self) -> dict[str, dict[str, Array]]:
@@ -97,26 +75,6 @@ class Collector:
         for (name, row), tick in zip(self._ticked, unwrapped, strict=True):
             out[name]["at"][row] = tick
         return out
-
-    # ---- signals --------------------------------------------------------------------------------------
-    def frame_stats(self, describe: Callable[[str], tuple[int, str, float, bool]], period_s: float | None) -> tuple[FrameStat, ...]:
-        """One row per message by id. `describe(name)` gives (id, sender, cycle in ms, sent once per job)."""
-        stats = []
-        for name, reception in self.receptions.items():
-            can_id, sender, cycle_ms, per_job = describe(name)
-            gaps_ms = np.diff(np.array(reception.t_ns, dtype=np.int64)) / 1e6
-            span_s = (reception.t_ns[-1] - reception.t_ns[0]) / 1e9
-            faults = reception.faults
-            stats.append(FrameStat(
-                can_id=can_id, name=name, sender=sender, cycle_ms=cycle_ms,
-                expected_ms=period_s * 1e3 if per_job and period_s else cycle_ms, count=len(reception.t_ns),
-                rate_hz=gaps_ms.size / span_s if span_s > 0 else 0.0,
-                gap_min_ms=float(gaps_ms.min()) if gaps_ms.size else None,
-                gap_max_ms=float(gaps_ms.max()) if gaps_ms.size else None,
-                counter_gaps=faults.get(LOST, 0) + faults.get(WRONG_SEQUENCE, 0),
-                repeats=faults.get(REPEATED, 0), crc_errors=faults.get(WRONG_CRC, 0),
-            ))
-        return tuple(sorted(stats, key=lambda s: s.can_id))
 
 
 @dataclass(frozen=True)

@@ -68,16 +68,16 @@ class Jobs:
 class FrameStat:
     """One id on the bus. Gaps are times between consecutive receptions, in ms, None with fewer than two frames.
 
-    `expected_ms` is the cycle of the DBC, except for frames sent once per job: those follow the estimator's period.
+    `cycle_ms` is that of the DBC; of frames sent once per job it is the estimator's period.
     """
 
     can_id: int
     name: str
     sender: str
     cycle_ms: float
-    expected_ms: float
     count: int
-    rate_hz: float
+    rate_hz: float | None
+    rate_ok: bool | None
     gap_min_ms: float | None
     gap_max_ms: float | None
     counter_gaps: int
@@ -100,7 +100,7 @@ class ReportData:
     """Everything on the page.
 
     `result` has the keys of the runner's result JSON. `lockstep` says that no wake latency can exist. `notices` are
-    shown as a banner: a truncated log, a result that was recomputed, missing truth.
+    shown as banners: a log that was never finished, a result that was recomputed, what the system did not grant.
     """
 
     source: str
@@ -109,6 +109,7 @@ class ReportData:
     lockstep: bool
     result: dict[str, Any]
     result_from_log: bool
+    complete: bool
     duration_s: float
     cycle_start_s: float | None
     winding: Temperature

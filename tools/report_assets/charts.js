@@ -99,7 +99,7 @@ const Charts = (() => {
   });
   const decade = v => v != null && Math.abs(Math.log10(v) - Math.round(Math.log10(v))) < 1e-9;
   const yAxis = (axis, index) => ({
-    ...axisLook(), scale: axis.scale, side: index ? 1 : 3, size: axis.unit === "µs" ? 62 : 54, label: axis.label,
+    ...axisLook(), scale: axis.scale, side: index ? 1 : 3, space: axis.log ? 18 : 26, size: axis.unit === "µs" ? 62 : 54, label: axis.label,
     grid: index ? { show: false } : { stroke: () => css("--grid"), width: 1 },
     ...(axis.colour ? { stroke: () => css(axis.colour) } : {}),
     values: (u, splits) => splits.map(v => v == null || (axis.log && !decade(v)) ? ""
@@ -108,7 +108,9 @@ const Charts = (() => {
   });
   const decimals = splits => {
     const step = Math.abs(splits[1] - splits[0]);
-    return step >= 1 || !step ? 0 : Math.min(4, Math.ceil(-Math.log10(step) - 1e-9));
+    let digits = 0;
+    while (digits < 4 && Math.abs(step * 10 ** digits - Math.round(step * 10 ** digits)) > 1e-6) digits++;
+    return digits;
   };
   const xAxis = x => ({
     ...axisLook(), size: 30, label: x.label, labelSize: 18,
@@ -126,10 +128,10 @@ const Charts = (() => {
       const a = u.valToPos(span.t0, "x", true), b = u.valToPos(span.t1, "x", true);
       ctx.fillStyle = css(span.kind === "status" ? "--shade-status" : "--shade");
       ctx.fillRect(a, bbox.top, Math.max(b - a, px), bbox.height);
-      ctx.font = `${11 * px}px system-ui, sans-serif`; ctx.fillStyle = css("--soft"); ctx.textBaseline = "top";
+      ctx.font = `${11 * px}px system-ui, sans-serif`; ctx.fillStyle = css("--soft"); ctx.textBaseline = "top"; ctx.textAlign = "left";
       if (c.name_spans && ctx.measureText(span.label).width + 10 * px < b - a) ctx.fillText(span.label, Math.max(a, bbox.left) + 5 * px, bbox.top + 4 * px);
     }
-    for (const axis of c.y) {
+    for (const axis of c.y.slice(0, 1)) {
       const zero = axis.zero && !axis.log ? u.valToPos(0, axis.scale, true) : NaN;
       if (!Number.isFinite(zero)) continue;
       ctx.strokeStyle = css("--faint"); ctx.lineWidth = px; ctx.beginPath();
@@ -170,30 +172,46 @@ const Charts = (() => {
     return `<svg viewBox="0 0 22 10" aria-hidden="true" style="stroke:var(${s.colour});fill:none">${middle}</svg>`;
   };
 
-  const legend = (host, c, plot, xText) => {
-    const at = Object.assign(document.createElement("span"), { className: "x" });
-    host.append(at);
-    const values = c.series.map((s, i) => {
-      const button = document.createElement("button");
-      button.type = "button"; button.setAttribute("aria-pressed", "true"); button.title = "show or hide";
-      button.innerHTML = swatch(s);
-      const value = Object.assign(document.createElement("span"), { className: "v" });
-      button.append(s.label, value);
-      button.onclick = () => {
-        const on = !plot.series[i + 1].show;
-        plot.setSeries(i + 1, { show: on }); button.setAttribute("aria-pressed", String(on));
-      };
-      host.append(button);
-      return value;
+  const legend = (host, c, plot) => c.series.forEach((s, i) => {
+    const button = document.createElement("button");
+    button.type = "button"; button.setAttribute("aria-pressed", "true"); button.title = "show or hide";
+    button.innerHTML = swatch(s);
+    button.append(s.label);
+    button.onclick = () => {
+      const on = !plot.series[i + 1].show;
+      plot.setSeries(i + 1, { show: on }); button.setAttribute("aria-pressed", String(on));
+    };
+    host.append(button);
+  });
+
+  /* Values under the cursor in a box beside it, so that nothing else on the page has to move. */
+  const readout = (c, plot, xText) => {
+    const box = Object.assign(document.createElement("div"), { className: "readout", hidden: true });
+    const head = document.createElement("div");
+    box.append(head);
+    const rows = c.series.map(s => {
+      const row = document.createElement("div"), value = document.createElement("b");
+      row.innerHTML = swatch(s);
+      row.append(s.label, value);
+      box.append(row);
+      return { row, value };
     });
+    plot.over.append(box);
     return () => {
-      const idx = plot.cursor.idx;
-      at.textContent = idx == null ? "" : xText(plot.data[0][idx], plot);
-      values.forEach((v, i) => {
-        const k = idx == null ? null : plot.cursor.idxs ? plot.cursor.idxs[i + 1] : idx;
-        const y = k == null ? null : plot.data[i + 1][k];
-        v.textContent = k == null ? "" : show(c.series[i].zero_below > y ? 0 : y, c.series[i]);
+      const { idx, left } = plot.cursor;
+      box.hidden = idx == null || left < 0;
+      if (box.hidden) return;
+      head.textContent = xText(plot.data[0][idx], plot);
+      rows.forEach(({ row, value }, i) => {
+        const s = c.series[i], k = plot.cursor.idxs[i + 1], y = k == null ? null : plot.data[i + 1][k];
+        // A mark far from the cursor says nothing about the place under it.
+        const near = s.style !== "marks" || (k != null && Math.abs(plot.valToPos(plot.data[0][k], "x") - left) < 6);
+        row.hidden = !plot.series[i + 1].show || !near;
+        value.textContent = show(y != null && y < s.zero_below ? 0 : y, s);
       });
+      const right = left > plot.over.clientWidth / 2;
+      box.style.left = right ? "" : left + 12 + "px";
+      box.style.right = right ? plot.over.clientWidth - left + 12 + "px" : "";
     };
   };
 
@@ -201,7 +219,8 @@ const Charts = (() => {
   const build = (section, c, hooks) => {
     const host = section.querySelector(".plot"), lines = c.lines || [];
     const tables = c.series.map(s => [s.dt ? times(s.dt) : s.x, s.y]);
-    const data = tables.length > 1 ? uPlot.join(tables) : tables[0];
+    // 2 = expand: where a series has a null, its gap reaches over the other series' times up to its next sample.
+    const data = tables.length > 1 ? uPlot.join(tables, tables.map(() => [0, 2])) : tables[0];
     const options = {
       width: host.clientWidth, height: c.height, legend: { show: false }, padding: [10, c.y.length > 1 ? 4 : 14, 0, 0],
       scales: { x: c.x.log ? { time: false, distr: 3, range: () => c.x.range } : { time: false, auto: false, range: (u, a, b) => [a, b] } },
@@ -221,7 +240,8 @@ const Charts = (() => {
     for (const axis of c.y) options.scales[axis.scale] = yScale(axis, lines);
     let refresh = null;
     const plot = new uPlot(options, data, host);
-    refresh = legend(section.querySelector(".legend"), c, plot, hooks.xText);
+    legend(section.querySelector(".legend"), c, plot);
+    refresh = readout(c, plot, hooks.xText);
     if (!c.x.log) plot.setScale("x", { min: c.x.range[0], max: c.x.range[1] });
     return plot;
   };

@@ -66,7 +66,7 @@
   /* Paper is light and narrower than most screens: A4 less its margins is about 700 CSS pixels. */
   addEventListener("beforeprint", () => {
     root.dataset.theme = "light";
-    for (const p of plots) p.plot.setSize({ width: 664, height: Math.min(p.height, 220) });
+    for (const p of plots) p.plot.setSize({ width: p.host.closest(".cols2") ? 320 : 672, height: Math.min(p.height, 172) });
   });
   addEventListener("afterprint", () => { applyTheme(); fit(); });
   root.dataset.ready = "true";
