@@ -48,9 +48,9 @@ def net_functions(weights: LstmWeights) -> list[ca.Function]:
 def net_header(weights: LstmWeights) -> str:
     """lstm_net.h."""
     forward, adjoint, slope = (c_signature(function) for function in net_functions(weights))
-    return f"""{BANNER}/* The trained net '{weights.name}': one LSTM layer of {weights.hidden} cells, output layer on the new hidden state.
- * All functions: pure (no memory of their own, no failure), any thread, about a microsecond or less. An output may
- * share memory with an input. Units: rpm, Nm, degC, degC/s. */
+    return f"""{BANNER}/* The trained net '{weights.name}': {weights.hidden} LSTM cells, output layer on the new h.
+ * All functions: pure (no memory of their own, no failure), any thread, about a microsecond or less.
+ * An output may share memory with an input. Units: rpm, Nm, degC, degC/s. */
 #ifndef LSTM_NET_H
 #define LSTM_NET_H
 
@@ -65,12 +65,12 @@ def net_header(weights: LstmWeights) -> str:
 extern const char lstm_weights_sha256[65];  /* of the weights file's bytes */
 extern const uint32_t lstm_weights_hash24;  /* its first 24 bits */
 
-/* One step: u = [speed rpm, torque Nm] mean of the interval, theta at its start; rate in degC/s over the interval.
- * tape records the activations for the adjoint. */
+/* One step: u = [speed rpm, torque Nm] mean of the interval, theta at its start; rate in degC/s over it. tape
+ * records the activations for the adjoint. */
 {forward};
 
-/* Vector-Jacobian product of one step at the recorded point: from the bars of (rate, c_next, h_next) to those of
- * (theta, c, h). */
+/* Vector-Jacobian product of one step at the recorded point: from the bars of (rate, c_next, h_next) to those
+ * of (theta, c, h). */
 {adjoint};
 
 /* Direct slope of each rate on its own temperature, [drate_w/dtheta_w, drate_r/dtheta_r] in 1/s. */
@@ -95,9 +95,7 @@ C_TYPES = {"int": "int32_t {0};", "float": "double {0};", "bool": "bool {0};", "
 
 def settings_header(count: int) -> str:
     """est_settings.h."""
-    members = "\n".join(
-        f"    {C_TYPES[field.kind].format(field.c_name):<36} /* {field.meaning} */" for field in FIELDS
-    )
+    members = "\n".join(f"    {C_TYPES[field.kind].format(field.c_name):<36} /* {field.meaning} */" for field in FIELDS)
     return f"""{BANNER}#ifndef EST_SETTINGS_H
 #define EST_SETTINGS_H
 
@@ -161,7 +159,7 @@ def _c_value(value: object) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; errors are one line on stderr and exit code 1."""
-    parser = argparse.ArgumentParser(prog="estimator_c.formulation.generate", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="estimator_c.formulation.generate", description="weights and settings to C")
     parser.add_argument("--weights", type=Path, required=True)
     parser.add_argument("--settings", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)

@@ -1,8 +1,8 @@
 """The net in CasADi: one step, its exact adjoint from recorded activations, its direct temperature slope.
 
-The LSTM is the paper's eq. (LSTMeq); scaling of inputs and outputs is folded into the weights here, once, so that
-all functions take rpm, Nm and degC and give degC/s. The adjoint is written from the recorded activations ("tape")
-because reverse mode then needs no exp at all; a test holds it against CasADi's own algorithmic derivative.
+The LSTM is the paper's eq. (LSTMeq); scaling of inputs and outputs is folded into the weights here, once, so
+that all functions take rpm, Nm and degC and give degC/s. The adjoint is written from the recorded activations
+("tape") because reverse mode then needs no exp at all; a test holds it against CasADi's own derivative.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Estimator settings: TOML files -> one constant table in C. The schema lives here, the values in settings/*.toml."""
+"""Estimator settings: TOML files -> one constant table in C. The schema is here, the values in settings/*.toml."""
 
 from __future__ import annotations
 
@@ -30,24 +30,52 @@ class Field:
 FIELDS = (
     Field("sensor", "delay_steps", "delay_steps", "int", 0, 50, "sensor delay in intervals of 0.1 s"),
     Field("sensor", "offset_degc", "offset_degc", "float", -50, 50, "known sensor offset, subtracted"),
-    Field("sensor", "timeout_s", "sensor_timeout_s", "float", 0.1, 60,
-          "status 'predicting' after this long without a measurement"),
+    Field(
+        "sensor",
+        "timeout_s",
+        "sensor_timeout_s",
+        "float",
+        0.1,
+        60,
+        "status 'predicting' after this long without a measurement",
+    ),
     Field("weights", "measurement", "weight_measurement", PER_CHANNEL, 0, 1e6, "Wy, 1/K^2"),
     Field("weights", "noise", "weight_noise", PER_CHANNEL, 1e-6, 1e9, "Ww, 1/K^2 per interval"),
     Field("weights", "arrival", "weight_arrival", PER_CHANNEL, 1e-9, 1e9, "P0 once the window is full, 1/K^2"),
     Field("weights", "prior", "weight_prior", PER_CHANNEL, 1e-9, 1e9, "P0 while the window grows, 1/K^2"),
-    Field("weights", "newest_measurement", "newest_measurement", "bool", 0, 1,
-          "the newest node carries a measurement residual"),
+    Field(
+        "weights",
+        "newest_measurement",
+        "newest_measurement",
+        "bool",
+        0,
+        1,
+        "the newest node carries a measurement residual",
+    ),
     Field("bounds", "hard", "hard_bounds", "bool", 0, 1, "bounds are a hard box, else a quadratic penalty"),
     Field("bounds", "lower_degc", "lower_degc", "float", -273.15, 1000, "lower bound on both temperatures"),
     Field("bounds", "upper_degc", "upper_degc", "float", -273.15, 1000, "upper bound on both temperatures"),
     Field("bounds", "weight", "bound_weight", "float", 0, 1e9, "penalty of soft bounds, 1/K^2 per node"),
     Field("solver", "max_sweeps", "max_sweeps", "int", 1, 100, "most gradient sweeps per step"),
     Field("solver", "tolerance_degc", "tolerance_degc", "float", 0, 1, "stop when the next change is below this"),
-    Field("start", "spin_up_steps", "spin_up_steps", "int", 0, 2000,
-          "steps of the net with the first input before the first node"),
-    Field("start", "max_gap_steps", "max_gap_steps", "int", 1, 60,
-          "intervals without motor frames bridged by holding; more restarts"),
+    Field(
+        "start",
+        "spin_up_steps",
+        "spin_up_steps",
+        "int",
+        0,
+        2000,
+        "steps of the net with the first input before the first node",
+    ),
+    Field(
+        "start",
+        "max_gap_steps",
+        "max_gap_steps",
+        "int",
+        1,
+        60,
+        "intervals without motor frames bridged by holding; more restarts",
+    ),
 )
 
 
@@ -100,19 +128,22 @@ def _value(path: Path, field: Field, data: dict[str, Any]) -> Any:
     where = f"{field.table}.{field.key}"
     if field.key not in data.get(field.table, {}):
         raise FormulationError(path, where, "is missing", REMEDY)
-    found = data[field.table][field.key]
+    found: Any = data[field.table][field.key]
     if field.kind == "bool":
         if type(found) is not bool:
             raise FormulationError(path, where, f"must be true or false, is {found!r}", REMEDY)
         return found
-    items = found if field.kind == PER_CHANNEL else [found]
-    if field.kind == PER_CHANNEL and (not isinstance(found, list) or len(found) != 2):
-        raise FormulationError(path, where, f"must be [winding, rotor], is {found!r}", REMEDY)
-    for item in items:
-        right_type = type(item) is int or (type(item) is float and field.kind != "int")
-        if not right_type or not math.isfinite(item) or not field.low <= item <= field.high:
-            kind = "a whole number" if field.kind == "int" else "a number"
-            raise FormulationError(path, where, f"must be {kind} in {field.low:g}..{field.high:g}, is {item!r}", REMEDY)
     if field.kind == PER_CHANNEL:
-        return tuple(float(item) for item in items)
-    return int(found) if field.kind == "int" else float(found)
+        if not isinstance(found, list) or len(found) != 2:
+            raise FormulationError(path, where, f"must be [winding, rotor], is {found!r}", REMEDY)
+        return tuple(_number(path, where, field, item) for item in found)
+    number = _number(path, where, field, found)
+    return int(number) if field.kind == "int" else number
+
+
+def _number(path: Path, where: str, field: Field, found: Any) -> float:
+    right_type = type(found) is int or (type(found) is float and field.kind != "int")
+    if not right_type or not math.isfinite(found) or not field.low <= found <= field.high:
+        kind = "a whole number" if field.kind == "int" else "a number"
+        raise FormulationError(path, where, f"must be {kind} in {field.low:g}..{field.high:g}, is {found!r}", REMEDY)
+    return float(found)

@@ -163,7 +163,7 @@ class _Reader:
 
 
 def _has_non_number(value: Any) -> bool:
-    """True where a nested list holds a string, null or boolean (numpy would turn some of them into numbers)."""
+    """True where a nested list holds a string, null or boolean (numpy would convert some of them)."""
     if isinstance(value, list):
         return any(_has_non_number(item) for item in value)
     return isinstance(value, bool) or not isinstance(value, (int, float))

@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +64,7 @@ class Out(ct.Structure):
     )  # fmt: skip
 
 
-@lru_cache(maxsize=None)
+@cache
 def load(weights: Path | None = None) -> Lib:
     """The estimator's library: compiled from the given weights, or build/lib when it carries lstm8.json.
 
@@ -129,7 +129,7 @@ class Lib:
             raise KeyError(name)
         setting = Setting.from_buffer_copy(found.contents)
         for field, value in changes.items():
-            if field not in dict(Setting._fields_):
+            if not hasattr(Setting, field):
                 raise KeyError(field)
             setattr(setting, field, pair(*value) if isinstance(value, tuple) else value)
         return setting
