@@ -76,7 +76,7 @@ def fit(
     """
     begun = time.monotonic()
     torch.manual_seed(s.seed)
-    parts = split(rows, s.seed)
+    parts = split(rows, s.fold)
     if start is None:
         scaling = Scaling.from_rates(rows.rates_degc_s[np.concatenate(parts.train)])
         net = LstmRates(s.hidden)
@@ -112,9 +112,7 @@ def fit(
             if epoch == s.epochs:
                 break
             for group in adam.param_groups:
-                group["lr"] = s.lr_end + 0.5 * (s.lr - s.lr_end) * (
-                    1.0 + math.cos(math.pi * epoch / s.epochs)
-                )
+                group["lr"] = s.lr_end + 0.5 * (s.lr - s.lr_end) * (1.0 + math.cos(math.pi * epoch / s.epochs))
             total = 0.0
             for _ in range(windows.batches_per_epoch()):
                 u, y = windows.draw()
@@ -197,24 +195,16 @@ def document_of(result: Fit, rows: Rows, lap: Rows | None, s: Settings) -> dict:
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m tools.train", description=(__doc__ or "").splitlines()[0]
-    )
+    parser = argparse.ArgumentParser(prog="python -m tools.train", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="data set written by tools.dataset")
     parser.add_argument("--lap", type=Path, help="rows of the test lap, for the figures in the weights file")
     parser.add_argument("--out", type=Path, required=True, help="weights file to write")
-    parser.add_argument(
-        "--start", type=Path, help="go on from this weights file instead of from random weights"
-    )
-    parser.add_argument(
-        "--budget-s", type=float, default=math.inf, help="stop after this time and keep the best"
-    )
+    parser.add_argument("--start", type=Path, help="go on from this weights file instead of from random weights")
+    parser.add_argument("--budget-s", type=float, default=math.inf, help="stop after this time and keep the best")
     parser.add_argument("--threads", type=int, default=1)
     for field in dataclasses.fields(Settings):
         option = "--" + field.name.replace("_", "-")
-        parser.add_argument(
-            option, type=type(field.default), default=field.default, help="default %(default)s"
-        )
+        parser.add_argument(option, type=type(field.default), default=field.default, help="default %(default)s")
     return parser.parse_args(argv)
 
 

@@ -17,6 +17,7 @@ class Settings:
 
     hidden: int = 8
     seed: int = 1
+    fold: int = 1  # which fifth of the trajectories is held out, 0..4
     epochs: int = 3000
     lr: float = 0.02
     lr_end: float = 1e-4
@@ -43,7 +44,7 @@ class Split:
     held_ids: tuple[int, ...]
 
 
-def split(rows: Rows, seed: int) -> Split:
+def split(rows: Rows, fold: int) -> Split:
     """About 80:20: every fifth trajectory in order of length, so that both kinds are on both sides.
 
     A data set of fewer than five trajectories gives the last fifth of each to the validation instead.
@@ -54,7 +55,7 @@ def split(rows: Rows, seed: int) -> Split:
         ends = list(zip(pieces, cuts, strict=True))
         return Split([p[:c] for p, c in ends], [p[c:] for p, c in ends], ())
     order = np.argsort([-len(p) for p in pieces], kind="stable")
-    held = sorted(int(i) for i in order[seed % 5 :: 5])
+    held = sorted(int(i) for i in order[fold % 5 :: 5])
     ids = np.unique(rows.trajectory)
     return Split(
         [p for i, p in enumerate(pieces) if i not in held],
@@ -70,9 +71,7 @@ def row_weights(n_rows: int, s: Settings) -> torch.Tensor:
     return (s.early_weight + (1.0 - s.early_weight) * ramp)[:, None, None]
 
 
-def loss_of(
-    error: torch.Tensor, weights: torch.Tensor, rate_scale: torch.Tensor, s: Settings
-) -> torch.Tensor:
+def loss_of(error: torch.Tensor, weights: torch.Tensor, rate_scale: torch.Tensor, s: Settings) -> torch.Tensor:
     """Loss of the normalised rate errors (rows, batch, 2).
 
     Mean square plus the mean square of the error's running integral in K: small errors of one sign, which the
@@ -93,9 +92,7 @@ class Windows:
         self.rng = np.random.default_rng(s.seed)
         self.length = min(round(s.window_s / s.dt_s), min(len(p) for p in pieces))
         self.u = torch.tensor((rows.x - scaling.in_offset) / scaling.in_scale, dtype=torch.float32)
-        self.y = torch.tensor(
-            (rows.rates_degc_s - scaling.out_offset) / scaling.out_scale, dtype=torch.float32
-        )
+        self.y = torch.tensor((rows.rates_degc_s - scaling.out_offset) / scaling.out_scale, dtype=torch.float32)
         self.starts = np.concatenate([p[: len(p) - self.length + 1] for p in pieces])
         self.rows_in_all = sum(len(p) for p in pieces)
         self.s = s
@@ -105,10 +102,7 @@ class Windows:
         return max(1, round(self.rows_in_all / (self.s.batch * self.length)))
 
     def draw(self) -> tuple[torch.Tensor, torch.Tensor]:
-        at = (
-            torch.from_numpy(self.rng.choice(self.starts, self.s.batch))[None, :]
-            + torch.arange(self.length)[:, None]
-        )
+        at = torch.from_numpy(self.rng.choice(self.starts, self.s.batch))[None, :] + torch.arange(self.length)[:, None]
         u, y = self.u[at], self.y[at]
         if self.s.theta_noise_degc > 0:
             u[:, :, 2:] += self.noise_scale * self.slow_noise()
