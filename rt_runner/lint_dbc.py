@@ -18,13 +18,12 @@ from cantools.database.can.c_source import camel_to_snake_case
 from rt_runner.dbc import COUNTER_STATES, NOT_AVAILABLE, DbcError, raw_limits
 from rt_runner.e2e import crc8h2f
 
-C_KEYWORDS = frozenset(
-    (
-        "auto break case char const continue default do double else enum extern float for goto if inline int "
-        "long register restrict return short signed sizeof static struct switch typedef union unsigned void "
-        "volatile while bool true false asm class new delete this template namespace private public protected"
-    ).split()  # noqa: SIM905 - a list of this length is no easier to read
-)
+_KEYWORDS = """
+    auto break case char const continue default do double else enum extern float for goto if inline int long
+    register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while
+    bool true false asm class new delete this template namespace private public protected virtual
+"""
+C_KEYWORDS = frozenset(_KEYWORDS.split())  # and C++'s, for whoever includes the header there
 UNIT_OF_SUFFIX = {
     "nm": "Nm", "rpm": "rpm", "degc": "degC", "mps": "m/s", "rad": "rad",
     "us": "us", "ms": "ms", "m": "m", "s": "s",

@@ -1,0 +1,61 @@
+"""Golden frames: for every message of the DBC, physical values and the bytes of a sender's first frame.
+
+The bytes were checked by hand against the table of the DBC (payload) and with cantools (CRC); they change only
+with the contract.
+"""
+
+GOLDEN: list[tuple[str, dict[str, float], str]] = [
+    (
+        "MotorState",
+        {"derating_active": 0.0, "torque_nm": -65.54, "speed_rpm": 9830.0, "tick": 52428.0},
+        "e60166e69899cccc",
+    ),
+    (
+        "TempMeas",
+        {"theta_w_meas_degc": 155.984375, "theta_r_meas_degc": 411.984375, "tick": 49151.0},
+        "3e01ff3fff7fffbf",
+    ),
+    ("Reference", {"speed_demand_mps": 16.383, "slope_rad": 0.0, "tick": 49151.0}, "0d01ff3f0000ffbf"),
+    (
+        "Estimate",
+        {"status": 1.0, "theta_w_est_degc": 52.39453125, "theta_r_est_degc": 103.59375, "tick": 52428.0},
+        "751165669899cccc",
+    ),
+    (
+        "EstimateInnov",
+        {"sweeps": 3.0, "innov_w_degc": -25.6015625, "innov_r_degc": 25.59765625, "tick": 52428.0},
+        "8d3166e69919cccc",
+    ),
+    (
+        "EstTimingA",
+        {
+            "miss_late": 0.0,
+            "warmup": 0.0,
+            "stale_input": 0.0,
+            "after_skip": 0.0,
+            "release_index": 11983725.0,
+            "wake_lat_us": 1438046.9,
+        },
+        "3d016ddbb6b56ddb",
+    ),
+    ("EstTimingB", {"miss_cause": 1.0, "exec_wall_us": 838860.7, "resp_us": 1258291.0}, "f011ffff7ffeffbf"),
+    ("EstReleases", {"releases": 5592405.0, "jobs": 11184810.0}, "0f01555555aaaaaa"),
+    ("EstMisses", {"miss_late": 16383.0, "miss_skipped": 32767.0, "overrun": 49151.0}, "5301ff3fff7fffbf"),
+    ("EstInputFaults", {"crc_errors": 16383.0, "seq_errors": 32767.0, "stale_inputs": 49151.0}, "fd01ff3fff7fffbf"),
+    ("EstBusFaults", {"rx_drops": 16383.0, "tx_drops": 32767.0, "rejected": 49151.0}, "d501ff3fff7fffbf"),
+    (
+        "TruthTemp",
+        {"theta_w_true_degc": 27.998046875, "theta_r_true_degc": 155.998046875, "tick": 49151.0},
+        "16f1ffcfff7fffbf",
+    ),
+    ("TruthVehicle", {"v_true_mps": 16.383, "distance_m": 52428.7, "tick": 49151.0}, "56f1fff3ff7fffbf"),
+    ("PlantStatus", {"ticks_late": 16383.0, "late_max_ms": 3276.7, "tx_retries": 49151.0}, "5901ff3fff7fffbf"),
+    ("EstIdentity", {"dbc_hash": 5592405.0, "weights_hash": 11184810.0}, "c701555555aaaaaa"),
+    ("EstBuild", {"build_hash": 5592405.0, "setting_id": 0.0}, "eb01555555000000"),
+    (
+        "EstGranted",
+        {"policy": 0.0, "priority": 33.0, "core": 127.0, "mlock": 0.0, "period_us": 13981011.0},
+        "a301217f005355d5",
+    ),
+    ("PlantIdentity", {"params_hash": 5592405.0, "scenario_hash": 11184810.0}, "d301555555aaaaaa"),
+]

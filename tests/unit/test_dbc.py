@@ -1,0 +1,148 @@
+"""The DBC: it says what the project agreed on, and a broken one is refused with one clear line."""
+
+import hashlib
+
+import cantools
+import pytest
+
+from rt_runner.dbc import DEFAULT_DBC, DbcError, load_dbc, parse_dbc
+
+# name: id, sender, cycle ms, {signal: (start, length, signed, factor, offset, has not_available)}
+U16, S16 = (16, False), (16, True)
+CONTRACT = {
+    "MotorState": (0x0A0, "PLANT", 10, {
+        "derating_active": (12, 1, False, 1, 0, False), "torque_nm": (16, *S16, 0.01, 0, True),
+        "speed_rpm": (32, *U16, 0.25, 0, True), "tick": (48, *U16, 1, 0, False)}),
+    "TempMeas": (0x1A0, "PLANT", 100, {
+        "theta_w_meas_degc": (16, *U16, 1 / 64, -100, True), "theta_r_meas_degc": (32, *U16, 1 / 64, -100, True),
+        "tick": (48, *U16, 1, 0, False)}),
+    "Reference": (0x1B0, "PLANT", 100, {
+        "speed_demand_mps": (16, *U16, 0.001, 0, True), "slope_rad": (32, *S16, 0.0001, 0, True),
+        "tick": (48, *U16, 1, 0, False)}),
+    "Estimate": (0x2A0, "ESTIMATOR", 100, {
+        "status": (12, 4, False, 1, 0, True), "theta_w_est_degc": (16, *U16, 1 / 256, -50, True),
+        "theta_r_est_degc": (32, *U16, 1 / 256, -50, True), "tick": (48, *U16, 1, 0, False)}),
+    "EstimateInnov": (0x2A1, "ESTIMATOR", 100, {
+        "sweeps": (12, 4, False, 1, 0, False), "innov_w_degc": (16, *S16, 1 / 256, 0, True),
+        "innov_r_degc": (32, *S16, 1 / 256, 0, True), "tick": (48, *U16, 1, 0, False)}),
+    "EstTimingA": (0x2A8, "ESTIMATOR", 100, {
+        "miss_late": (12, 1, False, 1, 0, False), "warmup": (13, 1, False, 1, 0, False),
+        "stale_input": (14, 1, False, 1, 0, False), "after_skip": (15, 1, False, 1, 0, False),
+        "release_index": (16, 24, False, 1, 0, False), "wake_lat_us": (40, 24, False, 0.1, 0, True)}),
+    "EstTimingB": (0x2A9, "ESTIMATOR", 100, {
+        "miss_cause": (12, 4, False, 1, 0, True), "exec_wall_us": (16, 24, False, 0.1, 0, True),
+        "resp_us": (40, 24, False, 0.1, 0, True)}),
+    "EstReleases": (0x4A0, "ESTIMATOR", 1000, {
+        "releases": (16, 24, False, 1, 0, False), "jobs": (40, 24, False, 1, 0, False)}),
+    "EstMisses": (0x4A1, "ESTIMATOR", 1000, {
+        n: (s, *U16, 1, 0, False) for n, s in (("miss_late", 16), ("miss_skipped", 32), ("overrun", 48))}),
+    "EstInputFaults": (0x4A2, "ESTIMATOR", 1000, {
+        n: (s, *U16, 1, 0, False) for n, s in (("crc_errors", 16), ("seq_errors", 32), ("stale_inputs", 48))}),
+    "EstBusFaults": (0x4A3, "ESTIMATOR", 1000, {
+        n: (s, *U16, 1, 0, False) for n, s in (("rx_drops", 16), ("tx_drops", 32), ("rejected", 48))}),
+    "TruthTemp": (0x6A0, "PLANT", 100, {
+        "theta_w_true_degc": (12, 18, False, 1 / 512, -100, True),
+        "theta_r_true_degc": (30, 18, False, 1 / 512, -100, True), "tick": (48, *U16, 1, 0, False)}),
+    "TruthVehicle": (0x6A1, "PLANT", 100, {
+        "v_true_mps": (12, 16, False, 0.001, 0, True), "distance_m": (28, 20, False, 0.1, 0, True),
+        "tick": (48, *U16, 1, 0, False)}),
+    "PlantStatus": (0x6B0, "PLANT", 1000, {
+        "ticks_late": (16, *U16, 1, 0, False), "late_max_ms": (32, *U16, 0.1, 0, True),
+        "tx_retries": (48, *U16, 1, 0, False)}),
+    "EstIdentity": (0x7A0, "ESTIMATOR", 10000, {
+        "dbc_hash": (16, 24, False, 1, 0, False), "weights_hash": (40, 24, False, 1, 0, False)}),
+    "EstBuild": (0x7A1, "ESTIMATOR", 10000, {
+        "build_hash": (16, 24, False, 1, 0, False), "setting_id": (40, 8, False, 1, 0, True)}),
+    "EstGranted": (0x7A2, "ESTIMATOR", 10000, {
+        "policy": (12, 4, False, 1, 0, False), "priority": (16, 8, False, 1, 0, True),
+        "core": (24, 8, False, 1, 0, True), "mlock": (32, 1, False, 1, 0, False),
+        "period_us": (40, 24, False, 1, 0, True)}),
+    "PlantIdentity": (0x7B0, "PLANT", 10000, {
+        "params_hash": (16, 24, False, 1, 0, False), "scenario_hash": (40, 24, False, 1, 0, False)}),
+}  # fmt: skip
+
+
+def test_the_file_is_the_agreed_contract():
+    dbc = load_dbc()
+    found = {
+        m.name: (m.frame_id, m.sender, m.cycle_ms, {
+            s.name: (s.start, s.length, s.is_signed, s.factor, s.offset, s.raw_na is not None) for s in m.payload
+        })
+        for m in dbc
+    }  # fmt: skip
+    assert found == CONTRACT
+    assert all(m.length == 8 and not m.codec.is_extended_frame for m in dbc)
+    assert {m.name for m in dbc if m.simulation_only} == {"TruthTemp", "TruthVehicle"}
+    assert {m.name for m in dbc if m.per_job} == {"Estimate", "EstimateInnov", "EstTimingA", "EstTimingB"}
+
+
+def test_cantools_loads_it_strictly_and_shows_labels():
+    db = cantools.database.load_file(DEFAULT_DBC, strict=True)
+    status = db.get_message_by_name("Estimate").get_signal_by_name("status")
+    assert {int(k): str(v) for k, v in status.choices.items()} == {
+        0: "init", 1: "starting", 2: "ok", 3: "predicting", 4: "input_stale", 5: "invalid", 15: "not_available",
+    }  # fmt: skip
+
+
+def test_not_available_is_all_ones_or_most_negative_and_never_a_valid_code():
+    for message in load_dbc():
+        for s in message.signals:
+            if s.raw_na is not None:
+                assert s.raw_na == (-(1 << s.length - 1) if s.is_signed else (1 << s.length) - 1)
+                assert not s.raw_min <= s.raw_na <= s.raw_max
+                assert s.raw_start == s.raw_na, "before anything was measured there is nothing to show"
+
+
+def test_hash_is_the_file_s():
+    digest = hashlib.sha256(DEFAULT_DBC.read_bytes()).hexdigest()
+    assert load_dbc().sha256 == digest
+    assert load_dbc().hash24 == int(digest, 16) >> 232
+
+
+def test_max_delta_follows_from_the_timeout():
+    assert {m.name: m.max_delta for m in load_dbc()}["MotorState"] == 5
+    assert all(1 <= m.max_delta <= 14 for m in load_dbc())
+
+
+def test_unknown_message_name_lists_the_known_ones():
+    with pytest.raises(DbcError, match="Estimate"):
+        load_dbc()["estimate"]
+
+
+GOOD = DEFAULT_DBC.read_text(encoding="ascii")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        ("BO_ 160 MotorState", "BO_ 160 Motor State", "not a usable DBC"),
+        (": 16|16@1- (0.01,0)", ": 60|16@1- (0.01,0)", "not a usable DBC"),  # runs out of the frame
+        ('BA_ "GenMsgCycleTime" BO_ 160 10;', "", "MotorState has no attribute GenMsgCycleTime"),
+        ('BA_ "HilTimeoutMs" BO_ 160 50;', 'BA_ "HilTimeoutMs" BO_ 160 0;', "HilTimeoutMs is 0"),
+        ('BA_ "HilCrcSignal" BO_ 160 "crc";', 'BA_ "HilCrcSignal" BO_ 160 "crc8";', "needs the CRC"),
+        ('BA_ "HilDataIdList" BO_ 160 "', 'BA_ "HilDataIdList" BO_ 160 "00', "not 16 bytes"),
+        (" (0.25,0) ", " (0,0) ", "factor 0"),
+        (" torque_nm : 16|16@1-", " torque_nm : 23|16@0-", "little-endian"),
+    ],
+)
+def test_a_broken_dbc_is_one_clear_line(tmp_path, before, after, says):
+    assert before in GOOD
+    path = tmp_path / "broken.dbc"
+    path.write_text(GOOD.replace(before, after, 1), encoding="ascii")
+    with pytest.raises(DbcError) as caught:
+        load_dbc(path)
+    text = str(caught.value)
+    assert says in text
+    assert str(path) in text
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize("content", [b"", b"not a dbc", b"\x00\xff" * 50, b'VERSION ""\n'])
+def test_what_is_no_dbc_is_refused(content):
+    with pytest.raises(DbcError):
+        parse_dbc(content, "x.dbc")
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(DbcError, match="cannot read the DBC"):
+        load_dbc(tmp_path / "none.dbc")
