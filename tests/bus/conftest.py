@@ -1,0 +1,26 @@
+"""Fixtures: one bus per test, on the hub always, on SocketCAN where there is a vcan0."""
+
+import pytest
+
+from tests.support.buses import TRANSPORTS, Buses, Hub, have_vcan
+
+
+@pytest.fixture
+def hub(tmp_path):
+    """A hub on the test's own socket, built with sanitizers."""
+    buses = Buses("", Hub(tmp_path / "bus", "--stall-s", "1"))
+    buses.bus = buses.hub.bus
+    yield buses
+    buses.close()
+
+
+@pytest.fixture(params=TRANSPORTS)
+def buses(request):
+    """A bus on each transport."""
+    if request.param == "hub":
+        yield request.getfixturevalue("hub")
+        return
+    have_vcan()
+    made = Buses("socketcan:vcan0", None)
+    yield made
+    made.close()
