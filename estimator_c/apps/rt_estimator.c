@@ -311,6 +311,7 @@ static int run_lockstep(const options *opt) {
     rt_environment_read(&run.end, true);
     if (exit_status != -1) {
         run.stopped_by = "input";
+        (void)rt_record_flush(&lockstep.writer); /* what was published before the mistake; the exit status tells of that */
     }
     est_report_final(stderr, &cycle, &run, &scratch);
     return exit_status == -1 ? EXIT_SUCCESS : exit_status;

@@ -36,7 +36,7 @@ rt_record_status rt_record_read(rt_record_reader *self, rt_record *out) {
     return RT_RECORD_OK;
 }
 
-static rt_record_status flush(rt_record_writer *self) {
+rt_record_status rt_record_flush(rt_record_writer *self) {
     size_t done = 0;
     while (done < self->used) {
         const ssize_t put = write(self->fd, self->buffer + done, self->used - done);
@@ -54,7 +54,7 @@ static rt_record_status flush(rt_record_writer *self) {
 
 rt_record_status rt_record_write(rt_record_writer *self, const rt_record *record) {
     if (sizeof self->buffer - self->used < sizeof *record) {
-        const rt_record_status status = flush(self);
+        const rt_record_status status = rt_record_flush(self);
         if (status != RT_RECORD_OK) {
             return status;
         }
@@ -72,5 +72,5 @@ rt_record_status rt_record_control(rt_record_writer *self, int64_t t_ns, uint8_t
     record.frame.can_dlc = 1;
     record.frame.data[0] = code;
     const rt_record_status status = rt_record_write(self, &record);
-    return status == RT_RECORD_OK ? flush(self) : status;
+    return status == RT_RECORD_OK ? rt_record_flush(self) : status;
 }

@@ -53,6 +53,9 @@ rt_record_status rt_record_read(rt_record_reader *self, rt_record *out);
 /* Appends a record; writes the buffer out when it is full. Blocks as the pipe does. RT_RECORD_OK or RT_RECORD_ERROR. */
 rt_record_status rt_record_write(rt_record_writer *self, const rt_record *record);
 
+/* Writes everything out. */
+rt_record_status rt_record_flush(rt_record_writer *self);
+
 /* Appends a control record and writes everything out. */
 rt_record_status rt_record_control(rt_record_writer *self, int64_t t_ns, uint8_t code);
 

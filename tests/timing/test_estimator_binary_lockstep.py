@@ -1,0 +1,333 @@
+"""The estimator binary in lock-step: every job accounted for, damaged frames without effect, bad input refused."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rt_runner.e2e import E2eStatus
+from rt_runner.records import END, TICK, Record
+from tests.timing.estimator_process import (
+    COUNTERS,
+    IDENTITY,
+    MS,
+    TICK_NS,
+    Plant,
+    binary,
+    drive,
+    lockstep,
+    per_job,
+    run_drive,
+    tick_record,
+    to_bytes,
+)
+
+OK, PREDICTING, INPUT_STALE = 2, 3, 4
+STALE_CAUSE = 4
+
+
+@pytest.fixture(scope="module", params=["release", "asan"])
+def program(request):
+    return binary(request.param)
+
+
+@pytest.fixture(scope="module")
+def release():
+    return binary("release")
+
+
+@pytest.mark.parametrize("period_ms", [100, 1, 10, 250, 1000])
+def test_one_estimate_per_job_and_everything_accounted_for(program, period_ms):
+    seconds = 4 if period_ms < 10 else 12
+    run = run_drive(program, drive(range(seconds * 100 + 1)), "--period-us", str(period_ms * 1000))
+    assert (run.status, run.errors) == (0, [])
+    jobs = list(per_job(run))
+    assert len(jobs) == seconds * 1000 // period_ms == run.final["jobs"] == run.final["releases"]
+    assert run.final["miss_skipped"] == 0
+    assert {f.e2e for f in run.frames} == {E2eStatus.OK}, "a gap in a counter"
+    assert run.controls == [*((t * TICK_NS, TICK) for t in range(seconds * 100 + 1)), (seconds * 1000 * MS, END)]
+    for n, (estimate, innov, timing_a, timing_b) in enumerate(jobs, start=1):
+        assert timing_a.values["release_index"] == n
+        assert timing_a.values["wake_lat_us"] is None, "nothing sleeps in lock-step"
+        assert timing_b.values["resp_us"] >= timing_b.values["exec_wall_us"] > 0
+        assert {f.t_ns for f in (estimate, innov, timing_a, timing_b)} == {n * period_ms * MS}
+        # Releases run at TICK, when everything before has been delivered: the newest tick is the one in use.
+        assert estimate.values["tick"] == n * period_ms // 10
+        assert innov.values["tick"] == estimate.values["tick"]
+    for name in COUNTERS:  # once a second of release time, and at the end
+        assert [f.t_ns for f in run.named(name)] == [s * 1000 * MS for s in range(1, seconds + 1)] + [
+            seconds * 1000 * MS
+        ]
+    for name in IDENTITY:
+        first = period_ms * MS
+        assert [f.t_ns for f in run.named(name)] == ([first] if seconds < 10 else [first, 10_000 * MS])
+    assert jobs[-1][0].values["status"] == OK
+    assert run.named("EstReleases")[-1].values["jobs"] == len(jobs)
+
+
+def test_the_estimate_follows_the_measurement(release):
+    run = run_drive(release, drive(range(2001)))
+    for frame in run.named("Estimate")[-50:]:
+        assert frame.values["status"] == OK
+        # The drive's sensor says 79 + 0.1 K/s and 69; the offset of -1 is known to the default setting.
+        assert frame.values["theta_w_est_degc"] == pytest.approx(80 + frame.values["tick"] * 1e-3, abs=3)
+        assert frame.values["theta_r_est_degc"] == pytest.approx(70, abs=3)
+
+
+def test_identity_says_what_runs(release):
+    run = run_drive(release, drive(range(200)), "--setting", "paper", "--period-us", "50000")
+    assert run.ready["ready"] is True
+    assert run.ready["setting"] == "paper"
+    identity, build, granted = (run.named(name)[0].values for name in IDENTITY)
+    assert f"{int(identity['dbc_hash']):06x}" == run.ready["dbc_hash"][:6]
+    assert f"{int(identity['weights_hash']):06x}" == run.ready["weights_hash"][:6]
+    assert f"{int(build['build_hash']):06x}" == run.ready["build_hash"][:6]
+    assert build["setting_id"] == 1
+    assert granted["period_us"] == 50_000
+    assert granted["policy"] == 0
+    assert run.ready["policy"] == "other"
+
+
+def test_same_input_same_bytes(release):
+    records = drive(range(500))
+    first, second = run_drive(release, records), run_drive(release, records)
+    assert first.payload() == second.payload()
+    assert len(first.payload()) == 2 * 49
+
+
+BASE = drive(range(301))
+BASE_RUN: dict = {}
+
+noise = st.one_of(
+    st.builds(lambda b, bit: ("flip", b, bit), st.integers(0, 7), st.integers(0, 7)),
+    st.builds(lambda i, d: ("foreign", i, d), st.integers(0x200, 0x7FF), st.binary(max_size=8)),
+    st.builds(lambda d: ("extended", 0x800000A0, d), st.binary(max_size=8)),
+    st.builds(lambda d: ("remote", 0x400000A0, d), st.binary(max_size=8)),
+    st.builds(lambda d: ("error", 0x20000004, d), st.binary(min_size=1, max_size=8)),
+    st.builds(lambda d: ("length", 0x0A0, d), st.binary(max_size=7)),
+    st.just(("long", 0x0A0, b"\0" * 8)),
+    st.just(("repeat", 0, b"")),
+)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.tuples(st.integers(1, 300), noise), max_size=40))
+def test_what_is_damaged_or_foreign_changes_no_estimate(release, extras):
+    """Garbage between the good frames: every Estimate keeps its very bytes, and every piece is counted once."""
+    by_tick: dict[int, list] = {}
+    for tick, extra in extras:
+        by_tick.setdefault(tick, []).append(extra)
+    raw, tick = b"", 0
+    count = dict.fromkeys(("flip", "foreign", "extended", "remote", "error", "length", "long", "repeat"), 0)
+    for record in BASE:
+        raw += to_bytes([record])
+        if record.can_id != 0x0A0:
+            continue
+        tick = record.t_ns // TICK_NS
+        for kind, a, b in by_tick.get(tick, ()):
+            count[kind] += 1
+            if kind == "flip":
+                data = bytearray(record.data)
+                data[a] ^= 1 << b
+                raw += to_bytes([Record(record.t_ns, 0x0A0, bytes(data))])
+            elif kind == "repeat":
+                raw += to_bytes([record])
+            elif kind == "long":
+                raw += struct.pack("=qIB3x8s", record.t_ns, 0x0A0, 9, b)
+            else:
+                raw += to_bytes([Record(record.t_ns, a, b)])
+    raw += to_bytes([tick_record(3000 * MS, END)])
+    run = lockstep(release, raw)
+    if not BASE_RUN:
+        BASE_RUN["payload"] = run_drive(release, BASE).payload()
+    assert (run.status, run.errors) == (0, [])
+    assert run.payload() == BASE_RUN["payload"]
+    final = run.final
+    # Ids that differ in the low bits of data only: a flip in the high nibble of byte 1 is under the CRC, too.
+    assert final["crc_errors"] == count["flip"] + count["length"]
+    assert final["seq_errors"] == count["repeat"]
+    assert final["foreign"] == count["foreign"]
+    assert final["rejected"] == count["extended"] + count["remote"] + count["error"] + count["long"]
+    faults, bus_faults = run.named("EstInputFaults")[-1].values, run.named("EstBusFaults")[-1].values
+    assert (faults["crc_errors"], faults["seq_errors"]) == (final["crc_errors"], final["seq_errors"])
+    assert bus_faults["rejected"] == final["rejected"]
+
+
+def test_lost_frames_are_counted_and_the_drive_goes_on(program):
+    records = [r for r in drive(range(1001)) if not (r.can_id == 0x0A0 and r.t_ns // TICK_NS in (400, 401, 700))]
+    run = run_drive(program, records)
+    assert run.status == 0
+    assert run.final["seq_errors"] == 2
+    assert run.final["rx"]["MotorState"]["frames_lost"] == 3
+    assert run.final["rx"]["MotorState"]["lost"] == 2
+    assert run.final["stale_inputs"] == 0
+    assert {f.values["status"] for f in run.named("Estimate")[30:]} == {OK}
+
+
+def test_silent_plant_makes_stale_inputs_and_is_seen_on_the_bus(program):
+    silent = range(600, 800)
+    records = [r for r in drive(range(1201)) if not (r.can_id == 0x0A0 and r.t_ns // TICK_NS in silent)]
+    run = run_drive(program, records)
+    assert run.status == 0
+    stale = [a.values["release_index"] for _, _, a, _ in per_job(run) if a.values["stale_input"]]
+    for estimate, _, timing_a, timing_b in per_job(run):
+        if timing_a.values["stale_input"]:
+            assert timing_b.values["miss_cause"] == STALE_CAUSE
+        if 61 <= timing_a.values["release_index"] <= 79:
+            assert timing_a.values["stale_input"] == 1
+            assert estimate.values["status"] == INPUT_STALE
+    assert stale[0] == 61, "at 6.0 s the newest frame is 10 ms old, at 6.1 s it is older than its timeout"
+    assert run.final["stale_inputs"] == len(stale) == run.named("EstInputFaults")[-1].values["stale_inputs"]
+    assert run.final["causes"]["stale_input"] == len(stale)
+    assert run.final["rx"]["MotorState"]["timeouts"] == 1
+    assert run.named("Estimate")[-1].values["status"] == OK
+
+
+def test_a_lost_sensor_is_stale_too_and_the_net_predicts(program):
+    records = [r for r in drive(range(1001)) if not (r.can_id == 0x1A0 and 500 <= r.t_ns // TICK_NS < 900)]
+    run = run_drive(program, records)
+    assert run.status == 0
+    assert PREDICTING in {f.values["status"] for f in run.named("Estimate")}
+    assert run.final["rx"]["TempMeas"]["timeouts"] == 1
+    assert run.final["stale_inputs"] > 30
+    assert run.named("Estimate")[-1].values["theta_w_est_degc"] is not None
+
+
+def test_values_not_available_are_never_used_as_numbers(program):
+    plant, records = Plant(), []
+    for tick in range(1001):
+        torque = None if 300 <= tick < 400 else 50.0
+        theta = None if 500 <= tick < 700 else 79.0
+        records.append(Record(tick * TICK_NS, 0x0A0, plant.motor(tick, torque_nm=torque)))
+        if tick % 10 == 0:
+            records.append(Record(tick * TICK_NS, 0x1A0, plant.temp(tick, theta_w_meas_degc=theta)))
+        records.append(tick_record(tick * TICK_NS))
+    run = run_drive(program, records)
+    assert run.status == 0
+    assert run.final["rx"]["MotorState"]["unavailable"] == 100
+    assert run.final["rx"]["TempMeas"]["unavailable"] == 20
+    for frame in run.named("Estimate")[30:]:
+        assert 60 < frame.values["theta_w_est_degc"] < 100
+
+
+def test_a_plant_that_floods_one_period_loses_frames_countably(program):
+    plant = Plant()
+    records = [Record(MS, 0x0A0, plant.motor(i)) for i in range(5000)] + [tick_record(1000 * MS)]
+    run = run_drive(program, records, "--period-us", "1000000")
+    assert run.final["rx_drops"] == 5000 - 4096
+    assert run.final["frames_received"] == 4096
+
+
+@pytest.mark.parametrize(
+    ("raw", "says"),
+    [
+        (b"", "ended without an END record"),
+        (to_bytes(drive(range(20))), "ended without an END record"),
+        (to_bytes(drive(range(20)))[:-5], "inside a record"),
+        (to_bytes([tick_record(5 * MS), tick_record(4 * MS)]), "goes back"),
+        (to_bytes([tick_record(-1)]), "goes back"),
+        (to_bytes([tick_record(2**62)]), "leaps"),
+        (to_bytes([Record(2**63 - 1, 0x0A0, b"12345678")]), "leaps"),
+    ],
+)
+def test_input_that_breaks_the_protocol_is_one_line_and_exit_1(program, raw, says):
+    run = lockstep(program, raw)
+    assert run.status == 1
+    assert len(run.errors) == 1
+    assert run.errors[0].startswith("rt_estimator: stdin: ")
+    assert says in run.errors[0]
+    assert run.final["releases"] == run.final["jobs"] + run.final["miss_skipped"]
+
+
+any_time = st.integers(0, 50 * MS)
+any_record = st.one_of(
+    st.tuples(
+        any_time, st.sampled_from([0x0A0, 0x1A0, 0x20000000]), st.integers(0, 255), st.binary(min_size=11, max_size=11)
+    ),
+    st.tuples(any_time, st.integers(0, 2**32 - 1), st.integers(0, 255), st.binary(min_size=11, max_size=11)),
+)
+
+
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.lists(st.one_of(any_record, st.just("good")), min_size=20, max_size=200),
+    st.sampled_from(["1000", "20000", "100000"]),
+    st.sampled_from(["default", "paper"]),
+    st.binary(max_size=30),
+)
+def test_random_records_break_nothing(records, period_us, setting, tail):
+    """Thousands of random records, padding bytes and lengths included, under the sanitizers."""
+    plant, raw, t_ns, tick = Plant(), b"", 0, 0
+    for record in records:
+        if record == "good":
+            tick += 1
+            t_ns += TICK_NS
+            raw += to_bytes([Record(t_ns, i, d) for i, d in plant.frames(tick)] + [tick_record(t_ns)])
+        else:
+            step, can_id, length, rest = record
+            t_ns += step
+            raw += struct.pack("=qIB", t_ns, can_id, length) + rest
+    run = lockstep(binary("asan"), raw + tail, "--period-us", period_us, "--setting", setting)
+    assert run.status in (0, 1)
+    assert all(line.startswith("rt_estimator: ") for line in run.errors), run.errors
+    assert run.final["releases"] == run.final["jobs"] + run.final["miss_skipped"]
+    assert run.final["estimates_sent"] == run.final["jobs"] == len(run.named("Estimate"))
+    assert {f.e2e for f in run.frames} <= {E2eStatus.OK}
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 65535), st.floats(-400, 400), st.floats(0, 20000), st.floats(-200, 1000), st.integers(0, 300)
+        ),
+        min_size=5,
+        max_size=150,
+    )
+)
+def test_valid_frames_with_wild_content_break_nothing(steps):
+    """Good CRCs, any values, any jump of the plant's tick, any timing: finite or not available, never undefined."""
+    plant, records, t_ns = Plant(), [], 0
+    for tick, torque, speed, theta, wait_ms in steps:
+        t_ns += wait_ms * MS
+        records += [
+            Record(t_ns, 0x0A0, plant.motor(tick, torque_nm=torque, speed_rpm=speed)),
+            Record(t_ns, 0x1A0, plant.temp(tick, theta_w_meas_degc=theta)),
+            tick_record(t_ns),
+        ]
+    run = run_drive(binary("asan"), records, "--period-us", "10000")
+    assert (run.status, run.errors) == (0, [])
+    assert run.final["estimates_sent"] == run.final["jobs"] == len(run.named("Estimate"))
+    assert {f.e2e for f in run.frames} <= {E2eStatus.OK}
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["--lockstep", "--period-us", "999"], "--period-us: '999'"),
+        (["--lockstep", "--period-us", "1e5"], "--period-us: '1e5'"),
+        (["--lockstep", "--period-us", "1000001"], "--period-us: '1000001'"),
+        (["--lockstep", "--setting", "papper"], "no setting is called 'papper'; compiled in are: default, paper"),
+        (["--lockstep", "--core", "-1"], "--core: '-1'"),
+        (["--lockstep", "--priority", "0"], "--priority: '0'"),
+        (["--lockstep", "--bus", "socketcan:vcan0"], "give either"),
+        ([], "give either"),
+        (["--bogus"], "--bogus: unknown option"),
+        (["--lockstep", "extra"], "'extra' is no option"),
+        (["--bus", "rt_hub:/nonexistent/hub.sock"], "/nonexistent/hub.sock"),
+        (["--bus", "socketcan:nope0"], "nope0"),
+        (["--bus", "pigeon"], "pigeon"),
+    ],
+)
+def test_set_up_errors_are_one_line_and_exit_1(program, args, says):
+    done = subprocess.run([program, *args], input="", capture_output=True, text=True, timeout=20, check=False)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("rt_estimator: ")
+    assert says in lines[0]
