@@ -110,6 +110,8 @@ class Run:
     ready: dict | None
     final: dict | None
     errors: list[str]
+    lost_here: int = 0  # frames our own witness was too slow for
+    life_s: float = 0.0  # from ready to the end
 
     def named(self, name: str) -> list[Frame]:
         return [f for f in self.frames if f.name == name]
@@ -169,6 +171,7 @@ class OnBus:
         line = self.process.stdout.readline() if self.process.stdout else ""
         if not line:
             raise AssertionError(self.process.communicate()[1])
+        self._born = time.monotonic()
         self.ready = json.loads(line)
         assert self.ready["dbc_hash"] == DBC_SHA256, (
             f"{program} was built from another DBC: run 'make build build-asan'"
@@ -181,9 +184,10 @@ class OnBus:
             thread.start()
 
     def _read(self) -> None:
-        while not self._stop.is_set():
+        message = None
+        while message is not None or not self._stop.is_set():  # to the end, and then until the bus is quiet
             try:
-                message = self._witness.recv(0.05)
+                message = self._witness.recv(0.3 if self._stop.is_set() else 0.05)
             except Exception:  # the bus ended: the test that ends it looks at the estimator, not at us
                 return
             if message is not None:
@@ -213,7 +217,7 @@ class OnBus:
         if signal_number is not None:
             self.process.send_signal(signal_number)
         out, err = self.process.communicate(timeout=20)
-        time.sleep(0.3)
+        life_s = time.monotonic() - self._born
         self._stop.set()
         for thread in self._threads:
             thread.join()
@@ -225,7 +229,8 @@ class OnBus:
             decoded = decoder.decode(m.arbitration_id, bytes(m.data)) if not m.is_extended_id else None
             if decoded is not None and decoded.name.startswith("Est"):
                 frames.append(Frame(round(m.timestamp * 1e9), decoded.name, decoded.values, decoded.e2e, bytes(m.data)))
-        return Run(self.process.returncode, frames, [], self.ready, final, noise + err.splitlines())
+        lost = getattr(self._witness, "rx_drops", 0)
+        return Run(self.process.returncode, frames, [], self.ready, final, noise + err.splitlines(), lost, life_s)
 
 
 def per_job(run: Run) -> Iterator[tuple[Frame, ...]]:
