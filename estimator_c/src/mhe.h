@@ -8,7 +8,7 @@
  * tridiagonal solve per channel with the Gauss-Newton matrix that keeps each stage's direct slope but leaves out what
  * passes through the net's memory. Its fixed point is the exact KKT point of the problem above.
  *
- * Everything: no allocation, no clock, no printing; one thread at a time per object; state sizeof(mhe_t) (15 kB with 8
+ * Everything: no allocation, no clock, no printing; one thread at a time per object; state sizeof(mhe_t) (11 kB with 8
  * cells), owned by the caller. Without an active bound no branch depends on data other than the number of sweeps. */
 #ifndef MHE_H
 #define MHE_H
