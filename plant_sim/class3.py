@@ -7,6 +7,7 @@ each phase covers its distance. Seed 0 is the base trace.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,12 +39,16 @@ _DECEL = 1.35
 _LAG_S = 2.0
 
 
+@lru_cache(maxsize=64)
 def class3_trace(seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return speed in m/s at 0..1800 s (1801,) and the five phase borders in s."""
+    """Return speed in m/s at 0..1800 s (1801,) and the five phase borders in s, both read only."""
     rng = np.random.default_rng([seed, 3])
     traces = [_phase_trace(phase, rng) for phase in PHASES]
     borders = np.cumsum([0] + [p.duration_s for p in PHASES])
-    return np.concatenate([[0.0], *traces]), borders
+    v = np.concatenate([[0.0], *traces])
+    v.setflags(write=False)
+    borders.setflags(write=False)
+    return v, borders
 
 
 def class3_cycle(seed: int = 0, v_max_mps: float = 130.0 / 3.6) -> Cycle:
@@ -62,6 +67,8 @@ def _phase_trace(phase: Phase, rng: np.random.Generator) -> NDArray[np.float64]:
             continue
         for _ in range(60):
             middle = 0.5 * (low + high)
+            if middle in (low, high):
+                break
             if _distance(level, peak, middle, phase) > phase.distance_m:
                 low = middle
             else:
@@ -111,11 +118,15 @@ def _follow(
     target = v_top * np.where(peak, 1.06, np.minimum(level**bend, 1.0) * (level > 0.0))
     v, out = 0.0, np.empty(phase.duration_s)
     dt = 1.0 / _SUB
-    for i in range(level.size):
-        rate = (target[i] - v) / _LAG_S
+    for i, wanted in enumerate(target.tolist()):
+        rate = (wanted - v) / _LAG_S
         rise = 1.45 - 0.027 * v
-        v = max(v + dt * min(max(rate, -_DECEL), rise), 0.0)
-        if target[i] == 0.0 and v < 0.15:
+        if rate > rise:
+            rate = rise
+        elif rate < -_DECEL:
+            rate = -_DECEL
+        v += dt * rate
+        if wanted == 0.0 and v < 0.15:
             v = 0.0
         if (i + 1) % _SUB == 0:
             out[(i + 1) // _SUB - 1] = min(v, v_top)

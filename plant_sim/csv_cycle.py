@@ -84,8 +84,8 @@ def read_csv_cycle(
     slope = np.interp(grid, axis, slope)
     if speed is not None:
         v = np.clip(np.interp(grid, axis, speed), 0.0, params.vehicle.v_max_mps)
-        if by_distance:
-            v[0] = max(v[0], _START_MPS)
+        if by_distance:  # a stop has no duration over distance: the car would stand there for ever
+            v = np.maximum(v, _START_MPS)
     else:
         assert curvature is not None
         v = speed_profile(np.interp(grid, axis, curvature), slope, step, a_lat_mps2, params)

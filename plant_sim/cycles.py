@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from plant_sim.errors import CycleError
 from plant_sim.params import PlantParams
 
+SLOWEST_MPS = 0.5  # of a cycle over distance
 CYCLE_KINDS = ("lap", "class3", "csv")
 
 
@@ -101,10 +102,10 @@ class Cycle:
             raise CycleError(f"cycle '{self.name}': speed and slope must be finite")
         if self.v_ref_mps.min() < 0.0:
             raise CycleError(f"cycle '{self.name}': negative reference speed; the car only drives forwards")
-        if self.by_distance and self.v_ref_mps[0] <= 0.0:
+        if self.by_distance and self.v_ref_mps.min() < SLOWEST_MPS:
             raise CycleError(
-                f"cycle '{self.name}': reference speed at distance 0 is zero, so the car would never start; "
-                f"give the first row a small speed such as 3 m/s"
+                f"cycle '{self.name}': reference speed falls below {SLOWEST_MPS} m/s; over distance the car would "
+                f"stand there for ever, so raise the speed"
             )
 
     @property

@@ -6,6 +6,7 @@ two together.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from math import atan, cos, exp, pi, sin, tanh
 from typing import NamedTuple
 
@@ -165,8 +166,9 @@ class CompiledEngine:
         return rows[:done]
 
 
+@lru_cache(maxsize=8)
 def _pack(params: PlantParams) -> tuple[Scalars, Tables]:
-    """Flatten parameters and derived tables."""
+    """Flatten parameters and derived tables (read only; 20 MB, cached by parameters)."""
     v, m, d, c = params.vehicle, params.machine, params.driver, params.loss
     lptn, network = build_lptn(params), build_network(params)
     dq_map = build_dq_map(m)

@@ -1,4 +1,4 @@
-"""Heat capacities and conductances of the machine, derived from geometry and material.
+"""Conductances of the machine, derived from geometry and material.
 
 A plane wall gives k A / d, a cylinder shell 2 pi k L / ln(r_o / r_i); resistances in series add. Convection
 follows Gnielinski (jacket), Becker and Kaye (air gap) and Schubert (end space).
@@ -12,6 +12,14 @@ from math import log, pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from plant_sim.capacities import (
+    capacities_j_k,
+    copper_area_m2,
+    copper_volumes_m3,
+    end_lengths_m,
+    ring_m2,
+    yoke_split_m,
+)
 from plant_sim.errors import ParameterError
 from plant_sim.nodes import AMBIENT, COOLANT, GEARBOX, INDEX, N_NODES, SIDES, SLICES
 from plant_sim.params import PlantParams
@@ -60,8 +68,8 @@ def build_network(params: PlantParams) -> Network:
     """Derive capacities and speed-independent conductances from the parameters."""
     return Network(
         params,
-        _capacities(params),
-        _copper_volumes(params),
+        capacities_j_k(params),
+        copper_volumes_m3(params),
         static_links(params),
         params.coolant.rho * params.coolant.flow_lpm / 60e3 * params.coolant.cp,
     )
@@ -172,29 +180,10 @@ def _shell(k: float, length: float, r_in: float, r_out: float) -> float:
     return 2.0 * pi * k * length / log(r_out / r_in)
 
 
-def _ring(r_in: float, r_out: float) -> float:
-    return pi * (r_out**2 - r_in**2)
-
-
-def _yoke_split(params: PlantParams) -> float:
-    return 0.5 * (params.geometry.r_slot_bottom_m + params.geometry.r_stator_m)
-
-
-def _copper_area(params: PlantParams) -> float:
-    """Copper cross-section of all slots in m2."""
-    return params.geometry.slots * params.geometry.slot_fill * params.geometry.slot_area_m2
-
-
-def _end_lengths(params: PlantParams) -> tuple[float, float]:
-    """Lengths of root and crown of one layer's end winding in m."""
-    half = params.geometry.end_turn_m / 2.0
-    return params.geometry.root_share * half, (1.0 - params.geometry.root_share) * half
-
-
 def _slice_links(params: PlantParams) -> list[Link]:
     g, m, c = params.geometry, params.material, params.contact
     ls = g.stack_m / 3.0
-    r_hi, split = g.r_stator_m + g.t_housing_inner_m, _yoke_split(params)
+    r_hi, split = g.r_stator_m + g.t_housing_inner_m, yoke_split_m(params)
     r_jacket = r_hi + g.jacket_height_m
     r_hi_mid, r_yo, r_yi = (
         g.r_stator_m + g.t_housing_inner_m / 2,
@@ -264,34 +253,34 @@ def _core_to_shaft(params: PlantParams) -> float:
 
 def _axial_links(params: PlantParams) -> list[tuple[str, float]]:
     g, m = params.geometry, params.material
-    ls, split = g.stack_m / 3.0, _yoke_split(params)
+    ls, split = g.stack_m / 3.0, yoke_split_m(params)
     r_hi = g.r_stator_m + g.t_housing_inner_m
     r_jacket = r_hi + g.jacket_height_m
     tooth = g.slots * g.tooth_width_m * (g.r_slot_bottom_m - g.r_bore_m) / 2
-    copper = m.k_cu * _copper_area(params) / 4 / ls
+    copper = m.k_cu * copper_area_m2(params) / 4 / ls
     return [
-        ("HI", m.k_al * _ring(g.r_stator_m, r_hi) / ls),
-        ("HO", m.k_al * _ring(r_jacket, r_jacket + g.t_housing_outer_m) / ls),
-        ("YO", m.k_fe_axial * _ring(split, g.r_stator_m) / ls),
-        ("YI", m.k_fe_axial * _ring(g.r_slot_bottom_m, split) / ls),
+        ("HI", m.k_al * ring_m2(g.r_stator_m, r_hi) / ls),
+        ("HO", m.k_al * ring_m2(r_jacket, r_jacket + g.t_housing_outer_m) / ls),
+        ("YO", m.k_fe_axial * ring_m2(split, g.r_stator_m) / ls),
+        ("YI", m.k_fe_axial * ring_m2(g.r_slot_bottom_m, split) / ls),
         ("T1", m.k_fe_axial * tooth / ls),
         ("T2", m.k_fe_axial * tooth / ls),
         ("WOp", copper),
         ("WOc", copper),
         ("WIp", copper),
         ("WIc", copper),
-        ("RS", m.k_fe_axial * _ring(g.r_rim_m, g.r_rotor_m) / ls),
+        ("RS", m.k_fe_axial * ring_m2(g.r_rim_m, g.r_rotor_m) / ls),
         ("MG", m.k_magnet * g.magnet_count * g.magnet_width_m * g.magnet_thickness_m / ls),
-        ("RC", m.k_fe_axial * g.rotor_solid * _ring(g.r_shaft_m, g.r_rim_m) / ls),
+        ("RC", m.k_fe_axial * g.rotor_solid * ring_m2(g.r_shaft_m, g.r_rim_m) / ls),
         ("SHF", m.k_steel * pi * g.r_shaft_m**2 / ((g.shaft_end_m + g.stack_m) / 2)),
     ]
 
 
 def _side_links(params: PlantParams) -> list[Link]:
     g, m, c = params.geometry, params.material, params.contact
-    layer = _copper_area(params) / 2
+    layer = copper_area_m2(params) / 2
     ls = g.stack_m / 3.0
-    root, crown = _end_lengths(params)
+    root, crown = end_lengths_m(params)
     to_root = m.k_cu * layer / 2 / (ls / 2 + root / 2)
     to_crown = m.k_cu * layer / (root / 2 + crown / 2)
     r_hi = g.r_stator_m + g.t_housing_inner_m
@@ -313,76 +302,10 @@ def _side_links(params: PlantParams) -> list[Link]:
         ("BO", "SH", c.g_outer_race_hub_w_k),
         ("BI", "BO", c.g_bearing_w_k),
         ("BI", "SHF", c.g_inner_race_shaft_w_k),
-        ("OH", "HI", m.k_al * _ring(g.r_stator_m, r_hi) / overlap),
-        ("OH", "HO", m.k_al * _ring(r_jacket, r_jacket + g.t_housing_outer_m) / overlap),
+        ("OH", "HI", m.k_al * ring_m2(g.r_stator_m, r_hi) / overlap),
+        ("OH", "HO", m.k_al * ring_m2(r_jacket, r_jacket + g.t_housing_outer_m) / overlap),
         ("CO", "OH", jacket_h(params) * 2 * pi * r_hi * g.overhang_jacket_m),
         ("RP", "RC", c.g_end_plate_core_w_k),
         ("RP", "RS", c.g_end_plate_rim_w_k),
         ("RP", "MG", c.g_end_plate_magnet_w_k),
     ]
-
-
-def _copper_volumes(params: PlantParams) -> NDArray[np.float64]:
-    """Copper volume of each node in m3 (70,), zero where there is none."""
-    volume = np.zeros(N_NODES)
-    area, ls = _copper_area(params), params.geometry.stack_m / 3.0
-    root, crown = _end_lengths(params)
-    for s in SLICES:
-        for name in ("WOp", "WOc", "WIp", "WIc"):
-            volume[INDEX[f"{name}_{s}"]] = area / 4 * ls
-    for s in SIDES:
-        for layer in "OI":
-            volume[INDEX[f"ER{layer}_{s}"]] = area / 2 * root
-            volume[INDEX[f"EC{layer}_{s}"]] = area / 2 * crown
-    return volume
-
-
-def _capacities(params: PlantParams) -> NDArray[np.float64]:
-    """Heat capacity of each node in J/K (70,)."""
-    g, m = params.geometry, params.material
-    ls, split = g.stack_m / 3.0, _yoke_split(params)
-    r_hi = g.r_stator_m + g.t_housing_inner_m
-    r_jacket, r_out = r_hi + g.jacket_height_m, r_hi + g.jacket_height_m + g.t_housing_outer_m
-    fe, al, steel = m.rho_fe * m.c_fe * g.stack_factor, m.rho_al * m.c_al, m.rho_steel * m.c_steel
-    tooth = fe * g.slots * g.tooth_width_m * (g.r_slot_bottom_m - g.r_bore_m) / 2 * ls
-    cap: dict[str, float] = {}
-    for s in SLICES:
-        cap |= {
-            f"CO_{s}": params.coolant.rho
-            * params.coolant.cp
-            * _ring(r_hi, r_jacket)
-            * ls
-            * params.coolant.cover,
-            f"HI_{s}": al * _ring(g.r_stator_m, r_hi) * ls,
-            f"YO_{s}": fe * _ring(split, g.r_stator_m) * ls,
-            f"YI_{s}": fe * _ring(g.r_slot_bottom_m, split) * ls,
-            f"T1_{s}": tooth,
-            f"T2_{s}": tooth,
-            f"AG_{s}": g.gap_capacity_j_k,
-            f"RS_{s}": fe * g.rim_solid * _ring(g.r_rim_m, g.r_rotor_m) * ls,
-            f"MG_{s}": g.magnet_mass_kg / 3 * m.c_magnet,
-            f"RC_{s}": fe * g.rotor_solid * _ring(g.r_shaft_m, g.r_rim_m) * ls,
-            f"HO_{s}": al * _ring(r_jacket, r_out) * ls,
-            f"SHF_{s}": steel * pi * g.r_shaft_m**2 * (g.stack_m if s == "M" else g.shaft_end_m),
-        }
-    for s in SIDES:
-        cap |= {
-            f"EA_{s}": m.rho_air_kg_m3 * m.c_air * g.end_air_volume_m3,
-            f"SF_{s}": g.flange_mass_kg * m.c_al,
-            f"SH_{s}": g.hub_mass_kg * m.c_al,
-            f"BI_{s}": g.bearing_inner_mass_kg * m.c_steel,
-            f"BO_{s}": g.bearing_outer_mass_kg * m.c_steel,
-            f"RP_{s}": g.end_plate_mass_kg * m.c_al,
-            f"OH_{s}": al * _ring(g.r_stator_m, r_out) * g.overhang_m * g.overhang_solid,
-        }
-    out = np.zeros(N_NODES)
-    for name, value in cap.items():
-        out[INDEX[name]] = value
-    # Winding nodes: copper plus the wetted share of the resin in the remaining slot space.
-    copper = _copper_volumes(params)
-    for name, i in INDEX.items():
-        if copper[i] > 0.0:
-            share = m.resin_share_slot if name.startswith("W") else m.resin_share_end
-            resin = copper[i] * (1.0 / g.slot_fill - 1.0) * share
-            out[i] = copper[i] * m.rho_cu * m.c_cu + resin * m.rho_resin * m.c_resin
-    return out
