@@ -6,6 +6,16 @@
 #define RING_MASK (ESTIMATOR_RING - 1)
 #define OFF_GRID_LIMIT 10 /* that many temperature frames off the grid in a row mean the plant moved its grid */
 
+/* Larger magnitudes are no temperature in degC, torque in Nm or speed in rpm but a broken sender; they would wear off
+ * only after a hundred thousand windows. */
+#define ABSURD 1.0e6
+
+/* false for NaN too */
+static bool usable(double value)
+{
+    return fabs(value) < ABSURD;
+}
+
 static size_t slot(int64_t k)
 {
     return (size_t)(k & RING_MASK);
@@ -104,7 +114,7 @@ void estimator_feed_motor(estimator_t *self, uint16_t tick16, double torque_nm, 
     if (!take_tick(self, tick16)) {
         return;
     }
-    if (!valid || !isfinite(torque_nm) || !isfinite(speed_rpm)) {
+    if (!valid || !usable(torque_nm) || !usable(speed_rpm)) {
         self->counters.invalid_inputs++;
         return;
     }
@@ -149,7 +159,7 @@ void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc
                          bool r_valid)
 {
     const double y[MHE_CHANNELS] = {theta_w_degc - self->setting.offset_degc, theta_r_degc - self->setting.offset_degc};
-    const bool valid[MHE_CHANNELS] = {w_valid && isfinite(theta_w_degc), r_valid && isfinite(theta_r_degc)};
+    const bool valid[MHE_CHANNELS] = {w_valid && usable(theta_w_degc), r_valid && usable(theta_r_degc)};
     int64_t tick = self->motor_seen ? unwrap(self->newest_tick, tick16)
                    : self->anchored ? unwrap(self->newest_temp_tick, tick16)
                                     : tick16;

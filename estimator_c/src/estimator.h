@@ -99,7 +99,7 @@ typedef struct {
 /* Start empty with a copy of `setting`. < 5 us. ESTIMATOR_BAD_SETTING leaves the object unusable. */
 estimator_error_t estimator_init(estimator_t *self, const est_setting_t *setting);
 
-/* Take one MotorState. valid = false (or a value that is not finite): the tick counts, the values do not. A tick that
+/* Take one MotorState. valid = false (or a value not finite or beyond 1e6): the tick counts, the values do not. A tick that
  * went backwards or more than max_gap_steps intervals ahead restarts the estimator. Never fails. < 0.1 us. */
 void estimator_feed_motor(estimator_t *self, uint16_t tick16, double torque_nm, double speed_rpm, bool valid);
 
