@@ -185,7 +185,8 @@ class Plant:
         )
         first = -(self._tick + 1) % TICKS_PER_SAMPLE
         self._tick += rows.shape[0]
-        return rows, self._sensor.sample(rows[first::TICKS_PER_SAMPLE, ROW_THETA_W : ROW_THETA_R + 1])
+        due = rows[first::TICKS_PER_SAMPLE, ROW_THETA_W : ROW_THETA_R + 1]
+        return rows, self._sensor.sample(due) if due.size else due
 
     def _theta_pair(self) -> NDArray[np.float64]:
         t = self._theta
