@@ -11,11 +11,13 @@ from pathlib import Path
 from rt_runner import paths
 from rt_runner.config import Scenario
 from rt_runner.dbc import load_dbc
-from rt_runner.errors import RtError
+from rt_runner.errors import RtError, SetupError
 from rt_runner.mcap_log import LogWriter
 from rt_runner.records import CONTROL_ID, END, TICK, Record, control, pack, read_until_control
 from rt_runner.result import ResultAccumulator, RunFacts
-from rt_runner.supervisor import log_config
+from rt_runner.supervisor import check_same_dbc, log_config
+
+PROGRESS_NS = 1_000_000_000
 
 
 class _Peer:
@@ -23,6 +25,7 @@ class _Peer:
 
     def __init__(self, name: str, command: list[str]) -> None:
         self.name = name
+        self._words: list[str] = []
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                                         start_new_session=True)  # Ctrl-C is ours to handle
 
@@ -35,18 +38,35 @@ class _Peer:
             self.process.stdin.flush()
             return list(read_until_control(self.process.stdout))
         except (BrokenPipeError, EOFError):
-            raise RtError(self._obituary()) from None
+            raise RtError(self.obituary()) from None
 
     def json_lines(self) -> Iterator[dict]:
-        """JSON lines from standard error, up to its end."""
+        """JSON lines from standard error, up to its end; other lines are its words."""
         assert self.process.stderr is not None
         for raw in self.process.stderr:
-            with contextlib.suppress(ValueError):
+            try:
                 yield json.loads(raw)
+            except ValueError:
+                self._words.append(raw.decode(errors="replace").strip())
 
-    def _obituary(self) -> str:
-        assert self.process.stderr is not None
-        words = [w for w in self.process.stderr.read().decode(errors="replace").splitlines() if w.strip()]
+    def ready(self) -> dict:
+        """What it says about itself before the first record.
+
+        Raises
+        ------
+        SetupError
+            It ended instead.
+        """
+        for line in self.json_lines():
+            if "ready" in line:
+                return line
+        raise SetupError(self.obituary())
+
+    def obituary(self) -> str:
+        """One line on how it ended."""
+        for _ in self.json_lines():
+            pass
+        words = [w for w in self._words if w]
         return f"the {self.name} ended with exit status {self.process.wait()}; its last words: {words[-1] if words else '(none)'}"
 
     def close(self) -> None:
@@ -75,7 +95,7 @@ def run_lockstep(scenario: Scenario, seed: int, log: Path, progress: Callable[[d
     RtError
         A process ended early; the log up to there is complete and readable.
     """
-    dbc = load_dbc(paths.DBC)
+    dbc = load_dbc()
     plant_command = [sys.executable, "-m", "plant_sim", "--lockstep", "--scenario", str(scenario.path), "--seed", str(seed)]
     if scenario.duration_s:
         plant_command += ["--duration", str(scenario.duration_s)]
@@ -86,43 +106,50 @@ def run_lockstep(scenario: Scenario, seed: int, log: Path, progress: Callable[[d
                      seed=seed, limits=scenario.limits)
     accumulator = ResultAccumulator()
     peers: list[_Peer] = []
-    with LogWriter(log, dbc, config["run"], config["attachments"]) as writer:
-        def take(records: list[Record]) -> None:
-            for r in records:
-                if r.can_id != CONTROL_ID:
-                    decoded = writer.write(r.t_ns, r.can_id, r.data)
-                    if decoded is not None:
-                        accumulator.feed(r.t_ns, decoded.name, decoded.values, decoded.e2e)
-                        last.update(decoded.values)
-
-        last: dict = {}
-        granted: dict = {}
-        try:
-            for name, command in (("plant", plant_command), ("estimator", estimator_command)):
-                peers.append(_Peer(name, command))
-            plant, estimator = peers
-            granted = next((line for line in estimator.json_lines() if "ready" in line), {})
-            t_ns, frames, code = 0, 0, TICK
-            while code != END:
-                answer = plant.exchange(control(t_ns, TICK))
-                t_ns, code = answer[-1].t_ns, answer[-1].data[0]
-                take(answer)
-                chunk = b"".join(pack(*r) for r in answer[:-1]) + control(t_ns, TICK)
-                back = estimator.exchange(chunk)
-                take(back)
-                frames += len(answer) + len(back) - 2
-                if t_ns % 10_000_000_000 == 0:
-                    progress({"t_s": t_ns / 1e9, "frames": frames, **{k: last.get(k) for k in (
-                        "theta_w_est_degc", "theta_w_true_degc")}})
-            take(estimator.exchange(control(t_ns, END)))
-        except RtError as e:
-            facts = replace(facts, crash=str(e), stopped_by="crash")
-        except KeyboardInterrupt:
-            facts = replace(facts, stopped_by="interrupt")
-        finally:
-            for peer in peers:
-                peer.close()
-        result = accumulator.result(replace(facts, granted=granted))
-        writer.attach("granted.json", json.dumps(granted).encode())
-        writer.metadata("result", {"json": json.dumps(result)})
+    try:
+        plant = _Peer("plant", plant_command)
+        peers.append(plant)
+        estimator = _Peer("estimator", estimator_command)
+        peers.append(estimator)
+        granted = estimator.ready()
+        check_same_dbc(granted, dbc)
+        with LogWriter(log, dbc, config["run"], config["attachments"]) as writer:
+            try:
+                _shuttle(plant, estimator, writer, accumulator, progress)
+            except RtError as e:
+                facts = replace(facts, crash=str(e), stopped_by="crash")
+            except KeyboardInterrupt:
+                facts = replace(facts, stopped_by="interrupt")
+            result = accumulator.result(replace(facts, granted=granted))
+            writer.attach("granted.json", json.dumps(granted, sort_keys=True).encode())
+            writer.metadata("result", {"json": json.dumps(result)})
+    finally:
+        for peer in peers:
+            peer.close()
     return result
+
+
+def _shuttle(
+    plant: _Peer, estimator: _Peer, writer: LogWriter, accumulator: ResultAccumulator, progress: Callable[[dict], None]
+) -> None:
+    """Carry the frames until the plant's cycle ends."""
+    newest: dict[str, float | None] = {}
+
+    def take(records: list[Record]) -> None:
+        for r in records:
+            if r.can_id != CONTROL_ID:
+                decoded = writer.write(r.t_ns, r.can_id, r.data)
+                if decoded is not None:
+                    accumulator.feed(r.t_ns, decoded.name, decoded.values, decoded.e2e)
+                    newest.update(decoded.values)
+
+    t_ns, code = 0, TICK
+    while code != END:
+        answer = plant.exchange(control(t_ns, TICK))
+        t_ns, code = answer[-1].t_ns, answer[-1].data[0]
+        take(answer)
+        take(estimator.exchange(b"".join(pack(*r) for r in answer[:-1]) + control(t_ns, TICK)))
+        if t_ns % PROGRESS_NS == 0:
+            shown = {k: newest.get(k) for k in ("theta_w_est_degc", "theta_w_true_degc")}
+            progress({"t_s": t_ns / 1e9, "frames": writer.frames, **shown})
+    take(estimator.exchange(control(t_ns, END)))

@@ -1,4 +1,4 @@
-"""Where things are: the project's root, its DBC, what was built."""
+"""Where things are: the project's root and what was built."""
 
 import os
 from pathlib import Path
@@ -6,7 +6,6 @@ from pathlib import Path
 from rt_runner.errors import SetupError
 
 ROOT = Path(__file__).resolve().parent.parent
-DBC = ROOT / "dbc" / "drive.dbc"
 
 
 def build_dir() -> Path:

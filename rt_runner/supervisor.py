@@ -11,7 +11,8 @@ from rt_runner import machine, paths
 from rt_runner.bus import BusChoice, HubProcess
 from rt_runner.children import Child, ChildError
 from rt_runner.config import Scenario
-from rt_runner.errors import RtError
+from rt_runner.dbc import Dbc, load_dbc
+from rt_runner.errors import RtError, SetupError
 from rt_runner.result import RunFacts
 
 READY_S = 90.0  # the plant compiles its kernel at first use and drives to the scenario's start
@@ -42,6 +43,7 @@ class Supervisor:
 
     def __init__(self, plan: Plan, say: Callable[[str], None], progress: Callable[[dict], None]) -> None:
         self._plan, self._say, self._progress = plan, say, progress
+        self._dbc = load_dbc()
         self._core, self._others = machine.split_cores(plan.core)
         self._stopped = False
         self._children: list[Child] = []
@@ -107,6 +109,7 @@ class Supervisor:
             plant.wait_line("ready", READY_S, lambda: self._stopped)
             estimator = self._start("estimator", self._estimator_command(bus), None)
             granted = estimator.wait_line("ready", 10.0, lambda: self._stopped)
+            check_same_dbc(granted, self._dbc)
             facts = replace(facts, granted=granted)
             for warning in granted.get("warnings", []):
                 self._say(f"warning: estimator: {warning}")
@@ -173,9 +176,25 @@ class Supervisor:
         return result
 
 
+def check_same_dbc(granted: dict, dbc: Dbc) -> None:
+    """Refuse an estimator that was generated from another DBC than the one everybody else reads.
+
+    Raises
+    ------
+    SetupError
+        Its frames would be misread.
+    """
+    built = str(granted.get("dbc_hash", "")).lower().removeprefix("0x")
+    if not dbc.sha256.startswith(built) or not built:
+        raise SetupError(
+            f"the estimator was built from another DBC ({built or 'unknown'}) than {dbc.path} ({dbc.sha256[:6]}): "
+            "run 'make build'"
+        )
+
+
 def log_config(scenario: Scenario, bus: str, seed: int) -> dict:
     """What a log carries beside its frames: metadata ``run`` and the attachments that make the run repeatable."""
     run = {"scenario": scenario.name, "title": scenario.title, "bus": bus, "seed": str(seed),
            "setting": scenario.estimator.setting, "period_s": repr(scenario.estimator.period_s),
            "scenario_sha256": scenario.sha256, **machine.describe()}
-    return {"run": run, "attachments": {"scenario.toml": str(scenario.path), "drive.dbc": str(paths.DBC)}}
+    return {"run": run, "attachments": {"scenario.toml": str(scenario.path)}}

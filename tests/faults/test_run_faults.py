@@ -128,7 +128,8 @@ def test_usage_errors_exit_with_1(args):
 def test_unknown_setting_is_refused(tmp_path):
     done = rt_runner("mil", "hot-lap", "--duration", 1, "--setting", "guess", "--log", tmp_path / "x.mcap")
     assert done.returncode == 1
-    assert "guess" in done.stdout + done.stderr
+    assert "guess" in one_line(done.stderr.splitlines()[-1])
+    assert not (tmp_path / "x.mcap").exists()
 
 
 def test_a_log_path_that_is_a_folder(tmp_path):
@@ -137,7 +138,8 @@ def test_a_log_path_that_is_a_folder(tmp_path):
     assert str(tmp_path) in one_line(done.stderr.splitlines()[-1])
 
 
-def test_a_log_path_in_a_folder_that_does_not_exist(tmp_path):
+def test_a_log_path_whose_folder_cannot_be_made(tmp_path):
+    (tmp_path / "no").write_text("a file")
     done = rt_runner(*RUN, "--log", tmp_path / "no" / "x.mcap")
     assert done.returncode == 1
     assert "x.mcap" in one_line(done.stderr.splitlines()[-1])
