@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import os
 import socket
+import struct
 
 import can
 
 from .fd_bus import FdBus
 
-_CONNECT_TIMEOUT_S = 2.0  # a hub that was stopped accepts nobody
+_CONNECT_TIMEOUT_S = 2  # a hub that was stopped accepts nobody
 
 
 class HubBus(FdBus):
@@ -45,7 +46,8 @@ class HubBus(FdBus):
         kwargs.pop("bitrate", None)  # and has no bit rate
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
-            sock.settimeout(_CONNECT_TIMEOUT_S)
+            # Not settimeout: a non-blocking connect gives up at once when many connect at the same time.
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", _CONNECT_TIMEOUT_S, 0))
             sock.connect(path)
             if not receive:
                 sock.shutdown(socket.SHUT_RD)

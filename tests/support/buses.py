@@ -97,8 +97,8 @@ def have_vcan() -> None:
 def raw_client(path: Path) -> socket.socket:
     """A client of the hub that may send anything."""
     s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    s.settimeout(10)
     s.connect(str(path))
+    s.settimeout(10)
     return s
 
 
@@ -141,5 +141,6 @@ class Buses:
         for bus in self._open:
             bus.shutdown()
         if self.hub is not None and self.hub.process.poll() is None:
+            self.hub.process.send_signal(signal.SIGCONT)
             assert self.hub.counters(signal.SIGTERM)["final"]
             assert not self.hub.path.exists()
