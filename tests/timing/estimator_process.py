@@ -20,12 +20,12 @@ import pytest
 from rt_runner import paths
 from rt_runner.bus import open_bus
 from rt_runner.codec import Decoder, Encoder
-from rt_runner.dbc import load_dbc
+from rt_runner.dbc import DEFAULT_DBC, load_dbc
 from rt_runner.e2e import E2eStatus
 from rt_runner.records import CONTROL_ID, END, RECORD, TICK, Record, control, pack
 
-DBC = load_dbc(paths.DBC)
-DBC_SHA256 = hashlib.sha256(paths.DBC.read_bytes()).hexdigest()
+DBC = load_dbc()
+DBC_SHA256 = hashlib.sha256(DEFAULT_DBC.read_bytes()).hexdigest()
 MS = 1_000_000
 TICK_NS = 10 * MS
 PER_JOB = ("Estimate", "EstimateInnov", "EstTimingA", "EstTimingB")

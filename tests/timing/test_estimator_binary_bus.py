@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from rt_runner import paths
 from rt_runner.bus import HubProcess, choose_bus
 from rt_runner.e2e import E2eStatus
 from tests.support.runs import need_vcan
@@ -232,4 +231,3 @@ def test_a_set_up_that_needs_the_bus_says_so_and_leaves_nothing(tmp_path):
     assert done.stdout == ""
     assert len(done.stderr.splitlines()) == 1
     assert not list(tmp_path.iterdir())
-    assert paths.DBC.exists()

@@ -46,6 +46,11 @@ def test_one_estimate_per_job_and_everything_accounted_for(program, period_ms):
     run = run_drive(program, drive(range(seconds * 100 + 1)), "--period-us", str(period_ms * 1000))
     assert (run.status, run.errors) == (0, [])
     jobs = list(per_job(run))
+    warmup = max(5, -(-1000 // period_ms))
+    assert run.final["warmup"]["jobs"] == warmup
+    assert run.final["judged"]["jobs"] == run.final["resp_us"]["count"] == len(jobs) - warmup
+    assert run.final["last_second"]["resp_us"]["count"] == 1000 // period_ms
+    assert run.final["wake_lat_us"]["count"] == 0
     assert len(jobs) == seconds * 1000 // period_ms == run.final["jobs"] == run.final["releases"]
     assert run.final["miss_skipped"] == 0
     assert {f.e2e for f in run.frames} == {E2eStatus.OK}, "a gap in a counter"
@@ -53,6 +58,7 @@ def test_one_estimate_per_job_and_everything_accounted_for(program, period_ms):
     for n, (estimate, innov, timing_a, timing_b) in enumerate(jobs, start=1):
         assert timing_a.values["release_index"] == n
         assert timing_a.values["wake_lat_us"] is None, "nothing sleeps in lock-step"
+        assert timing_a.values["warmup"] == (n <= warmup)
         assert timing_b.values["resp_us"] >= timing_b.values["exec_wall_us"] > 0
         assert {f.t_ns for f in (estimate, innov, timing_a, timing_b)} == {n * period_ms * MS}
         # Releases run at TICK, when everything before has been delivered: the newest tick is the one in use.
