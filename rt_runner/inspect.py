@@ -65,7 +65,6 @@ def _head(summary: LogSummary) -> list[str]:
     if summary.start_ns is not None and summary.start_ns > 10**17:  # lock-step logs start at 0, not on a date
         start = datetime.fromtimestamp(summary.start_ns / 1e9, UTC)
         lines.append(f"started {start:%Y-%m-%d %H:%M:%S} UTC")
-    lines += [f"warning: {text}" for text in summary.trouble]
     return lines
 
 

@@ -14,7 +14,9 @@ def add_parser(subparsers) -> None:
 
 
 def run(args) -> int:
-    """Print it; returns 0 whatever the log's verdict is, 1 (by exception) if it cannot be read."""
+    """Print it; returns 0 whatever the log's verdict is, 1 if the log is unfinished, damaged or no log at all."""
+    import sys
+
     from rt_runner.inspect import as_json, show
     from rt_runner.log_summary import summarise
     from rt_runner.present import write_json
@@ -23,4 +25,7 @@ def run(args) -> int:
     write_json(as_json(summary), args.json)
     if args.json != "-":
         show(summary)
-    return 0
+    if not summary.trouble:
+        return 0
+    print(f"rt-runner: {args.log}: {'; '.join(summary.trouble)}", file=sys.stderr)
+    return 1
