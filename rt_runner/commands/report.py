@@ -25,8 +25,8 @@ def run(args) -> int:
     command += [*(["--json", args.json] if args.json else []), "--", args.log]
     # The tools lie beside this package, wherever the user stands.
     path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}, stderr=subprocess.PIPE,
-                          text=True, check=False)
+    environment = {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
+    done = subprocess.run(command, env=environment, stderr=subprocess.PIPE, text=True, check=False)
     words = done.stderr.strip().splitlines()
     if done.returncode == 0:
         if words:

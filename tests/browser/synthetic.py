@@ -18,7 +18,9 @@ from rt_runner.mcap_log import LogWriter
 from rt_runner.result import ResultAccumulator, RunFacts
 
 T0_NS = 1_790_000_000_000_000_000
-SCENARIO = b'title = "x"\n[limits]\ntheta_w_rmse_max_degc = 0.25\ntheta_r_rmse_max_degc = 0.25\n'
+SCENARIO = (
+    b'title = "x"\n[cycle]\nstart_s = 400\n[limits]\ntheta_w_rmse_max_degc = 0.25\ntheta_r_rmse_max_degc = 0.25\n'
+)
 Frame = tuple[int, str, dict[str, float | None]]
 
 
@@ -44,7 +46,7 @@ class Run:
 
     def skipped(self, release: int) -> bool:
         """Whether this activation never runs: by order, or because the job before it was late by over a period."""
-        return bool(self.skip_every) and release % self.skip_every == 0 or (release > 1 and self.late(release - 1))
+        return (bool(self.skip_every) and release % self.skip_every == 0) or (release > 1 and self.late(release - 1))
 
 
 def truth_degc(t_s: float) -> tuple[float, float]:
@@ -90,6 +92,7 @@ def _job(run: Run, t_ns: int, t_s: float, tick: int, release: int, rng: np.rando
     resp = step if run.lockstep else 112_000.0 if late else wake + step + 14
     t = t_ns if run.lockstep else t_ns + round(resp * 1e3)
     w, r = truth_degc(t_s)
+    tick = 0 if t_s < 0.3 else tick  # an estimator that has heard nothing yet has no tick to tell
     yield t, "Estimate", {"status": 1 if starting else 2, "tick": tick,
                           "theta_w_est_degc": None if starting else w - off + noise[0],
                           "theta_r_est_degc": None if starting else r + off + noise[1]}  # fmt: skip
@@ -110,12 +113,14 @@ def write_log(path: Path, run: Run, with_result: bool = True) -> dict | None:
     with LogWriter(path, dbc, about, {"scenario.toml": SCENARIO}) as writer:
         for t_ns, name, values in frames(run):
             message = encoders[dbc[name].sender].encode(name, values)
-            decoded = writer.write(t_ns, message.arbitration_id, message.data)
+            decoded = writer.write(t_ns, message.arbitration_id, bytes(message.data))
             if decoded is not None:
                 judge.feed(t_ns, decoded.name, decoded.values, decoded.e2e)
         if not with_result:
             return None
-        result = judge.result(RunFacts(bus=bus, scenario="hot-lap", lockstep=run.lockstep, seed=run.seed, granted=granted))
+        result = judge.result(
+            RunFacts(bus=bus, scenario="hot-lap", lockstep=run.lockstep, seed=run.seed, granted=granted)
+        )
         writer.attach("granted.json", json.dumps(granted).encode())
         writer.metadata("result", {"json": json.dumps(result)})
     return result

@@ -46,7 +46,10 @@ def make_report(log: Path, out: Path, json_file: str | None) -> None:
         raise UsageError(f"cannot write the report {out}: {e.strerror}; give another file with -o") from None
     write_json({**figures(data), "page": str(out), "page_bytes": len(page)}, json_file)
     verdict = data.result.get("verdict", "none")
-    print(f"report: {out}, {len(page) / 1e6:.2f} MB, verdict {verdict}", file=sys.stderr if json_file == "-" else sys.stdout)
+    print(
+        f"report: {out}, {len(page) / 1e6:.2f} MB, verdict {verdict}",
+        file=sys.stderr if json_file == "-" else sys.stdout,
+    )
 
 
 if __name__ == "__main__":

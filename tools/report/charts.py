@@ -61,19 +61,35 @@ def encode(trace: Trace, digits: int, max_points: int = MAX_POINTS) -> dict[str,
     return {"dt": np.diff(ticks, prepend=0).tolist(), "y": values}
 
 
-def _line(trace: Trace, label: str, unit: str, scale: str, colour: str, digits: int, **look: Any) -> list[dict[str, Any]]:
+def _line(
+    trace: Trace, label: str, unit: str, scale: str, colour: str, digits: int, **look: Any
+) -> list[dict[str, Any]]:
     """One drawn series, or none where the log has no such data."""
     if not trace:
         return []
     style = {"style": "line", "width": 1.5, "dash": None, **look}
-    return [{"label": label, "unit": unit, "scale": scale, "colour": colour, "digits": digits, **style,
-             **encode(trace, digits)}]
+    return [
+        {
+            "label": label,
+            "unit": unit,
+            "scale": scale,
+            "colour": colour,
+            "digits": digits,
+            **style,
+            **encode(trace, digits),
+        }
+    ]
 
 
 def _temperature_chart(name: str, title: str, symbol: str, node: Temperature, data: ReportData) -> dict[str, Any]:
     missing = [] if node.truth else ["this log has no truth: a real motor, or truth frames left out"]
     return {
-        "id": name, "title": title, "height": 250, "x": _time_axis(data), "spans": _spans(data), "name_spans": True,
+        "id": name,
+        "title": title,
+        "height": 250,
+        "x": _time_axis(data),
+        "spans": _spans(data),
+        "name_spans": True,
         "note": "; ".join(["estimate drawn at the time it is valid for, sensor when it arrives", *missing]),
         "y": [{"scale": "degc", "label": f"{symbol} (°C)", "unit": "°C", "min_span": 1.0}],
         "series": [
@@ -86,7 +102,11 @@ def _temperature_chart(name: str, title: str, symbol: str, node: Temperature, da
 
 def _error_chart(name: str, title: str, node: Temperature, data: ReportData) -> dict[str, Any]:
     return {
-        "id": name, "title": title, "height": 180, "x": _time_axis(data), "spans": _spans(data),
+        "id": name,
+        "title": title,
+        "height": 180,
+        "x": _time_axis(data),
+        "spans": _spans(data),
         "note": "at the same plant tick: the sensor's offset, noise and delay all count",
         "y": [{"scale": "k", "label": "error (K)", "unit": "K", "zero": True, "min_span": 0.2}],
         "series": [
@@ -98,12 +118,29 @@ def _error_chart(name: str, title: str, node: Temperature, data: ReportData) -> 
 
 def _drive_chart(data: ReportData) -> dict[str, Any]:
     return {
-        "id": "drive", "title": "Torque and speed", "height": 210, "x": _time_axis(data),
+        "id": "drive",
+        "title": "Torque and speed",
+        "height": 210,
+        "x": _time_axis(data),
         "spans": _spans(data, ("status",)),
         "note": _decimation_note(data.torque),
         "y": [
-            {"scale": "nm", "label": "torque (N·m)", "unit": "N·m", "zero": True, "min_span": 1.0, "colour": "--torque"},
-            {"scale": "rpm", "label": "speed (rpm)", "unit": "rpm", "zero": True, "min_span": 10.0, "colour": "--speed"},
+            {
+                "scale": "nm",
+                "label": "torque (N·m)",
+                "unit": "N·m",
+                "zero": True,
+                "min_span": 1.0,
+                "colour": "--torque",
+            },
+            {
+                "scale": "rpm",
+                "label": "speed (rpm)",
+                "unit": "rpm",
+                "zero": True,
+                "min_span": 10.0,
+                "colour": "--speed",
+            },
         ],
         "series": [
             *_line(data.torque, "torque", "N·m", "nm", "--torque", 1, width=1.2),
@@ -149,18 +186,36 @@ def _histogram_chart(data: ReportData) -> dict[str, Any]:
     for (label, _, colour, dash), counts in zip(chosen, histogram.counts, strict=True):
         # The last edge closes the last step; empty bins go under the axis, a log scale has no zero.
         y = [*(c if c else ZERO_COUNT for c in counts.tolist()), ZERO_COUNT]
-        series.append({"label": label, "unit": "jobs", "scale": "n", "colour": colour, "digits": 0, "style": "steps",
-                       "width": 1.8, "dash": dash, "x": edges, "y": y, "zero_below": 1})
+        series.append(
+            {
+                "label": label,
+                "unit": "jobs",
+                "scale": "n",
+                "colour": colour,
+                "digits": 0,
+                "style": "steps",
+                "width": 1.8,
+                "dash": dash,
+                "x": edges,
+                "y": y,
+                "zero_below": 1,
+            }
+        )
     deadline = _deadline(data, "x")
     values = [*edges, *(line["value"] for line in deadline)]
-    span = [10.0 ** np.floor(np.log10(min(values))), 10.0 ** np.ceil(np.log10(max(values) * 1.05))] if edges else [1, 1e5]
-    note = "all jobs, warm-up included; bins of 1/20 decade"
+    span = (
+        [10.0 ** np.floor(np.log10(min(values))), 10.0 ** np.ceil(np.log10(max(values) * 1.05))] if edges else [1, 1e5]
+    )
+    note = "wake latency and response from the intended release; all jobs, warm-up too; 20 bins a decade"
     if data.lockstep:
         note += "; wake latency and response n/a (lock-step)"
     return {
-        "id": "histogram", "title": "Timing histogram", "height": 280, "note": note, "lines": deadline,
-        "x": {"label": "time from the intended release; execution: duration of the step", "log": True,
-              "range": [float(span[0]), float(span[1])]},
+        "id": "histogram",
+        "title": "Timing histogram",
+        "height": 280,
+        "note": note,
+        "lines": deadline,
+        "x": {"label": "time (µs … s)", "log": True, "range": [float(span[0]), float(span[1])]},
         "y": [{"scale": "n", "label": "jobs per bin", "unit": "", "log": True, "floor": COUNT_FLOOR}],
         "series": series,
     }
@@ -183,17 +238,33 @@ def _response_chart(data: ReportData) -> dict[str, Any]:
         at = _thin(t_s.size)
         if at.size < t_s.size:
             notes.append(f"{at.size} of {t_s.size} {label} marks drawn")
-        series.append({"label": f"{label} ({t_s.size})", "unit": "µs", "scale": "us", "colour": colour, "digits": 1,
-                       "style": "marks", "hollow": hollow, "width": 2, **encode(Trace(t_s[at], y[at]), 1, MAX_MARKS)})
+        series.append(
+            {
+                "label": f"{label} ({t_s.size})",
+                "unit": "µs",
+                "scale": "us",
+                "colour": colour,
+                "digits": 1,
+                "style": "marks",
+                "hollow": hollow,
+                "width": 2,
+                **encode(Trace(t_s[at], y[at]), 1, MAX_MARKS),
+            }
+        )
     if data.lockstep:
         title, note = "Execution time over time", "response n/a (lock-step): no clock releases the jobs"
     else:
         title, note = "Response time over time", "skipped activations never ran: drawn on the deadline"
     return {
-        "id": "response", "title": title, "height": 220, "x": _time_axis(data),
+        "id": "response",
+        "title": title,
+        "height": 220,
+        "x": _time_axis(data),
         "spans": _spans(data, ("status",)),
-        "note": "; ".join([note, *notes]), "lines": _deadline(data, "us"),
-        "y": [{"scale": "us", "label": "time", "unit": "µs", "log": True}], "series": series,
+        "note": "; ".join([note, *notes]),
+        "lines": _deadline(data, "us"),
+        "y": [{"scale": "us", "label": "time", "unit": "µs", "log": True}],
+        "series": series,
     }
 
 

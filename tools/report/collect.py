@@ -48,10 +48,9 @@ class Collector:
         wanted = WANTED.get(name)
         if wanted is None:
             return
-        if wanted[0] == "tick":
-            tick = values.get("tick")
-            if tick is None:
-                return
+        tick = values.get("tick") if wanted[0] == "tick" else None
+        # An estimator that has heard no plant yet sends a tick that means nothing: only its status counts.
+        if tick is not None and (name != "Estimate" or values.get("theta_w_est_degc") is not None):
             self._ticks.append(int(tick))
             self._ticked.append((name, len(self._rows[name])))
         self._rows[name].append(tuple(values.get(signal) for signal in wanted))
@@ -66,12 +65,12 @@ class Collector:
 
     def columns(self) -> dict[str, dict[str, Array]]:
         """Per message its signals as float arrays (NaN: not available), `t_s`, and for those that carry ticks
-        `at`, the unwrapped tick, all on one common count."""
+        `at`, the unwrapped tick (NaN: none), all on one common count."""
         out = {name: self._columns(name) for name in WANTED}
         unwrapped = unwrap_ticks(np.array(self._ticks))
         for name in WANTED:
             if WANTED[name][0] == "tick":
-                out[name]["at"] = np.empty(len(self._rows[name]))
+                out[name]["at"] = np.full(len(self._rows[name]), np.nan)
         for (name, row), tick in zip(self._ticked, unwrapped, strict=True):
             out[name]["at"][row] = tick
         return out
@@ -92,9 +91,10 @@ class Signals:
 
 def signals_of(columns: dict[str, dict[str, Array]], lockstep: bool) -> Signals:
     """Turn columns into signals: temperatures on plant ticks, drive and jobs on reception."""
-    carriers = [columns[n] for n in ("MotorState", "TempMeas", "TruthTemp") if columns[n]["at"].size]
-    seen_at = np.concatenate([c["at"] for c in carriers]) if carriers else np.empty(0)
-    seen_t = np.concatenate([c["t_s"] for c in carriers]) if carriers else np.empty(0)
+    carriers = [columns[n] for n in ("MotorState", "TempMeas", "TruthTemp")]
+    seen_at = np.concatenate([c["at"] for c in carriers])
+    seen_t = np.concatenate([c["t_s"] for c in carriers])[np.isfinite(seen_at)]
+    seen_at = seen_at[np.isfinite(seen_at)]
     order = np.argsort(seen_t, kind="stable")
     seen_at, seen_t = seen_at[order], seen_t[order]
 
@@ -112,14 +112,15 @@ def signals_of(columns: dict[str, dict[str, Array]], lockstep: bool) -> Signals:
     motor = columns["MotorState"]
     drive = [with_gaps(motor["at"], Trace(motor["t_s"], motor[signal])) for signal in ("torque_nm", "speed_rpm")]
     cycle = float(np.median(TICK_S * seen_at - seen_t)) if seen_at.size else None
-    return Signals(node("w"), node("r"), drive[0], drive[1], _jobs(columns, lockstep), _spans(columns["Estimate"]), cycle)
+    return Signals(
+        node("w"), node("r"), drive[0], drive[1], _jobs(columns, lockstep), _spans(columns["Estimate"]), cycle
+    )
 
 
 def _once(column: dict[str, Array], signal: str) -> tuple[Array, Array, Array]:
     """Tick, reception and value with one sample per tick, the last: a loop faster than the ticks repeats them."""
-    at, t_s, value = column["at"], column["t_s"], column[signal]
-    if not at.size:
-        return at, t_s, value
+    placed = np.isfinite(column["at"])
+    at, t_s, value = column["at"][placed], column["t_s"][placed], column[signal][placed]
     _, from_end = np.unique(at[::-1], return_index=True)
     keep = at.size - 1 - from_end
     return at[keep], t_s[keep], value[keep]
@@ -145,7 +146,11 @@ def _jobs(columns: dict[str, dict[str, Array]], lockstep: bool) -> Jobs:
             part = np.arange(1, steps[i]) / steps[i]
             skipped.append(a["t_s"][i] + part * (a["t_s"][i + 1] - a["t_s"][i]))
     return Jobs(
-        t_s=a["t_s"], wake_us=a["wake_lat_us"], exec_us=exec_us, resp_us=resp_us, late=a["miss_late"] == 1,
+        t_s=a["t_s"],
+        wake_us=a["wake_lat_us"],
+        exec_us=exec_us,
+        resp_us=resp_us,
+        late=a["miss_late"] == 1,
         cause=tuple(CAUSES[int(c)] if np.isfinite(c) and int(c) < len(CAUSES) else CAUSES[0] for c in cause),
         skipped_t_s=np.concatenate(skipped) if skipped else np.empty(0),
     )

@@ -15,21 +15,27 @@ ELSEWHERE = ("title", "scenario", "bus", "seed", "period_s", "setting", "scenari
 
 def identity(reader: LogReader, run: Mapping[str, str], last: Mapping[str, Mapping[str, float | None]]) -> Pairs:
     """Hashes as the estimator and the plant sent them, checked against what the log has attached."""
+
     def sent(message: str, signal: str) -> str | None:
         value = last.get(message, {}).get(signal)
         return None if value is None else f"{int(value):06x}"
 
     dbc = reader.attachments.get("drive.dbc")
     pairs = [
-        ("DBC", _checked(sent("EstIdentity", "dbc_hash"), hashlib.sha256(dbc).hexdigest() if dbc is not None else None)),
+        (
+            "DBC",
+            _checked(sent("EstIdentity", "dbc_hash"), hashlib.sha256(dbc).hexdigest() if dbc is not None else None),
+        ),
         ("weights", sent("EstIdentity", "weights_hash")),
         ("estimator build", sent("EstBuild", "build_hash")),
         ("estimator setting", run.get("setting")),
         ("plant parameters", sent("PlantIdentity", "params_hash")),
         ("scenario", _checked(sent("PlantIdentity", "scenario_hash"), run.get("scenario_sha256"))),
     ]
-    pairs += [(f"attached {name}", f"{len(data)} B, sha256 {hashlib.sha256(data).hexdigest()[:16]}")
-              for name, data in sorted(reader.attachments.items())]
+    pairs += [
+        (f"attached {name}", f"{len(data)} B, sha256 {hashlib.sha256(data).hexdigest()[:16]}")
+        for name, data in sorted(reader.attachments.items())
+    ]
     return tuple((name, value if value is not None else "not in the log") for name, value in pairs)
 
 
@@ -39,7 +45,11 @@ def _checked(sent: str | None, attached_sha256: str | None) -> str | None:
         return None if attached_sha256 is None else f"{attached_sha256[:6]} (from the log's file; no process sent it)"
     if attached_sha256 is None:
         return sent
-    return f"{sent} ✓ the log's file" if attached_sha256.startswith(sent) else f"{sent} ✕ the log's file is {attached_sha256[:6]}"
+    return (
+        f"{sent} ✓ the log's file"
+        if attached_sha256.startswith(sent)
+        else f"{sent} ✕ the log's file is {attached_sha256[:6]}"
+    )
 
 
 def environment(run: Mapping[str, str], result: Mapping[str, Any], summary: LogSummary) -> Pairs:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import tomllib
@@ -13,10 +14,11 @@ from typing import Any
 from rt_runner.judge import Finding, overall
 from rt_runner.log_summary import MessageSummary, result_of
 from rt_runner.mcap_log import LogReader, LogSummary, summarise
-from rt_runner.result import ResultAccumulator, RunFacts
+from rt_runner.result import TICK_S, ResultAccumulator, RunFacts
 from tools.report.collect import KEPT_LAST, WANTED, Collector, signals_of
 from tools.report.data import FrameStat, ReportData
 from tools.report.provenance import environment, identity
+from tools.report.series import TICK_MODULUS
 
 POLICIES = ("other", "fifo", "rr")
 
@@ -31,6 +33,7 @@ def read_report(path: Path) -> ReportData:
     reader = LogReader(path)
     summary = summarise(path)
     run = reader.metadata.get("run", {})
+    scenario = _scenario(reader)
     collector = Collector()
     result = finite(result_of(reader.metadata))
     from_log = result is not None
@@ -43,7 +46,7 @@ def read_report(path: Path) -> ReportData:
         for frame in reader.frames():
             collector.feed(*frame)
             judge.feed(*frame)
-        result = finite(_judged(judge.result(_facts(reader, run, collector.last, lockstep)))) or {}
+        result = finite(_judged(judge.result(_facts(reader, run, scenario, collector.last, lockstep)))) or {}
     signals = signals_of(collector.columns(), lockstep)
     return ReportData(
         source=path.name,
@@ -54,7 +57,7 @@ def read_report(path: Path) -> ReportData:
         result_from_log=from_log,
         complete=summary.complete,
         duration_s=summary.duration_s,
-        cycle_start_s=signals.cycle_start_s,
+        cycle_start_s=_cycle_start_s(signals.cycle_start_s, scenario),
         winding=signals.winding,
         rotor=signals.rotor,
         torque=signals.torque,
@@ -78,29 +81,46 @@ def finite(tree: Any) -> Any:
     return None if isinstance(tree, float) and not math.isfinite(tree) else tree
 
 
-def _facts(reader: LogReader, run: Mapping[str, str], last: Mapping[str, Mapping], lockstep: bool) -> RunFacts:
+def _scenario(reader: LogReader) -> dict[str, Any]:
+    """The scenario that is attached, empty where there is none that can be read."""
+    with contextlib.suppress(KeyError, ValueError):
+        return tomllib.loads(reader.attachments["scenario.toml"].decode())
+    return {}
+
+
+def _cycle_start_s(from_ticks_s: float | None, scenario: Mapping[str, Any]) -> float | None:
+    """Cycle time at the start of the log. Ticks tell it but for whole wraps, the scenario tells how many."""
+    cycle = scenario.get("cycle")
+    planned_s = cycle.get("start_s", 0.0) if isinstance(cycle, dict) else 0.0
+    if from_ticks_s is None or not isinstance(planned_s, int | float):
+        return from_ticks_s
+    wrap_s = TICK_MODULUS * TICK_S
+    return from_ticks_s + wrap_s * round((planned_s - from_ticks_s) / wrap_s)
+
+
+def _facts(
+    reader: LogReader, run: Mapping[str, str], scenario: Mapping[str, Any], last: Mapping[str, Mapping], lockstep: bool
+) -> RunFacts:
     """What is known of a run that never wrote its result."""
     facts: dict[str, Any] = {
-        "bus": run.get("bus", "unknown"), "scenario": run.get("scenario", "unknown"), "lockstep": lockstep,
-        "period_s": _number(run.get("period_s")) or 0.1, "granted": _granted(reader, last),
+        "bus": run.get("bus", "unknown"),
+        "scenario": run.get("scenario", "unknown"),
+        "lockstep": lockstep,
+        "period_s": _number(run.get("period_s")) or 0.1,
+        "granted": _granted(reader, last),
     }
     seed = _number(run.get("seed"))
     facts["seed"] = None if seed is None else int(seed)
-    try:
-        facts["limits"] = tomllib.loads(reader.attachments["scenario.toml"].decode()).get("limits", {})
-    except (KeyError, ValueError):
-        pass  # no scenario in the log, or not a readable one: the runner's default limits
+    facts["limits"] = scenario.get("limits", {})
     return RunFacts.from_dict(facts)
 
 
 def _granted(reader: LogReader, last: Mapping[str, Mapping]) -> dict[str, Any]:
     """From the attachment that an orderly end writes, else from the estimator's own frame."""
-    try:
+    with contextlib.suppress(KeyError, ValueError):
         granted = json.loads(reader.attachments["granted.json"])
         if isinstance(granted, dict):
             return granted
-    except (KeyError, ValueError):
-        pass
     frame = last.get("EstGranted", {})
     policy, core, locked = frame.get("policy"), frame.get("core"), frame.get("mlock")
     return {
@@ -140,9 +160,18 @@ def _started(path: Path, summary: LogSummary, lockstep: bool) -> str:
 
 def _frame_stat(m: MessageSummary) -> FrameStat:
     return FrameStat(
-        can_id=int(m.can_id, 16), name=m.name, sender=m.sender, cycle_ms=m.cycle_ms, count=m.frames,
-        rate_hz=1e3 / m.mean_ms if m.mean_ms else None, rate_ok=m.rate_ok, gap_min_ms=m.min_ms, gap_max_ms=m.max_ms,
-        counter_gaps=m.counter_gaps, repeats=m.repeated, crc_errors=m.wrong_crc,
+        can_id=int(m.can_id, 16),
+        name=m.name,
+        sender=m.sender,
+        cycle_ms=m.cycle_ms,
+        count=m.frames,
+        rate_hz=1e3 / m.mean_ms if m.mean_ms else None,
+        rate_ok=m.rate_ok,
+        gap_min_ms=m.min_ms,
+        gap_max_ms=m.max_ms,
+        counter_gaps=m.counter_gaps,
+        repeats=m.repeated,
+        crc_errors=m.wrong_crc,
     )
 
 

@@ -40,9 +40,13 @@ def header(data: ReportData) -> str:
     kind = verdict if verdict in MARK else "inconclusive"
     mode = "model in the loop, lock-step" if data.lockstep else "real-time run"
     facts = [
-        ("scenario", result.get("scenario")), ("bus", result.get("bus")), ("duration", _seconds(result.get("duration_s"))),
-        ("period", _milliseconds(data.period_s)), *_granted(data),
-        ("frames logged", number(look_up(result, "log", "frames"))), ("frames lost", number(look_up(result, "log", "dropped"))),
+        ("scenario", result.get("scenario")),
+        ("bus", result.get("bus")),
+        ("duration", _seconds(result.get("duration_s"))),
+        ("period", _milliseconds(data.period_s)),
+        *_granted(data),
+        ("frames logged", number(look_up(result, "log", "frames"))),
+        ("frames lost", number(look_up(result, "log", "dropped"))),
         ("seed", result.get("seed")),
     ]
     strip = "".join(f"<div><dt>{esc(k)}</dt><dd>{esc(v)}</dd></div>" for k, v in facts)
@@ -70,22 +74,29 @@ def _granted(data: ReportData) -> list[tuple[str, Any]]:
     granted = data.result.get("granted") or {}
     policy, locked = granted.get("policy"), granted.get("mlock")
     policy = {"fifo": "SCHED_FIFO", "rr": "SCHED_RR", "other": "SCHED_OTHER (not real-time)"}.get(str(policy), policy)
-    return [("scheduling granted", policy), ("core", granted.get("core")),
-            ("memory locked", None if locked is None else "yes" if locked else "no")]
+    return [
+        ("scheduling granted", policy),
+        ("core", granted.get("core")),
+        ("memory locked", None if locked is None else "yes" if locked else "no"),
+    ]
 
 
 def key_figures(data: ReportData) -> str:
     """Accuracy, timing and findings side by side."""
-    return (f'<div class="grid keyfigs">{_accuracy(data.result)}{_timing(data)}{_findings(data)}</div>')
+    return f'<div class="grid keyfigs">{_accuracy(data.result)}{_timing(data)}{_findings(data)}</div>'
 
 
 def _findings(data: ReportData) -> str:
-    findings = data.result.get("findings") or []
-    rows = "".join(
-        f'<li><span class="dot {_kind(f)}" title="{_kind(f)}">{MARK[_kind(f)]}</span>'
-        f"<span><b>{esc(f.get('what'))}</b> · {esc(f.get('evidence'))}</span></li>"
-        for f in findings if isinstance(f, dict)
-    ) or '<li class="soft">the log gives no reasons for its verdict</li>'
+    findings = [f for f in data.result.get("findings") or [] if isinstance(f, dict)]
+    findings.sort(key=lambda f: ("fail", "inconclusive", "pass").index(_kind(f)))
+    rows = (
+        "".join(
+            f'<li><span class="dot {_kind(f)}" title="{_kind(f)}">{MARK[_kind(f)]}</span>'
+            f"<span><b>{esc(f.get('what'))}</b> · {esc(f.get('evidence'))}</span></li>"
+            for f in findings
+        )
+        or '<li class="soft">the log gives no reasons for its verdict</li>'
+    )
     return f'<section class="panel"><h2>Why this verdict</h2><ul class="findings">{rows}</ul></section>'
 
 
@@ -100,8 +111,10 @@ def _accuracy(result: dict[str, Any]) -> str:
         figures = look_up(result, "accuracy", key) or {}
         raw, est = figures.get("raw_rmse_degc"), figures.get("est_rmse_degc")
         ratio = f"{raw / est:.1f}×" if raw and est else NONE
-        rows.append(f'<tr><th scope="row">{name}</th><td class="n">{number(raw, 3)}</td><td class="n big">{number(est, 3)}</td>'
-                    f'<td class="n">{number(figures.get("est_max_degc"), 3)}</td><td class="n">{ratio}</td></tr>')
+        rows.append(
+            f'<tr><th scope="row">{name}</th><td class="n">{number(raw, 3)}</td><td class="n big">{number(est, 3)}</td>'
+            f'<td class="n">{number(figures.get("est_max_degc"), 3)}</td><td class="n">{ratio}</td></tr>'
+        )
     samples = look_up(result, "accuracy", "theta_w", "samples")
     judged = f"; {number(samples)} estimates judged" if samples is not None else ""
     return f"""<section class="panel"><h2>Accuracy against truth</h2><div class="scroll"><table>
@@ -123,11 +136,12 @@ def _timing(data: ReportData) -> str:
     late, skipped, jobs = timing.get("miss_late"), timing.get("miss_skipped"), timing.get("jobs")
     misses = LOCKSTEP if data.lockstep else f"{number(late)} late, {number(skipped)} skipped"
     causes = timing.get("causes") or {}
-    named = " (" + ", ".join(f"{number(n)} {esc(str(c).replace('_', ' '))}" for c, n in causes.items()) + ")" if causes else ""
+    named = ", ".join(f"{number(n)} {esc(str(c).replace('_', ' '))}" for c, n in causes.items())
+    blamed = f" · causes named by the jobs: {named}" if named and not data.lockstep else ""
     return f"""<section class="panel"><h2>Timing of the estimator</h2><div class="scroll"><table>
 <thead><tr><th></th><th class="n">p50<small>µs</small></th><th class="n">p99<small>µs</small></th>
 <th class="n">max<small>µs</small></th></tr></thead><tbody>{"".join(rows)}</tbody></table></div>
-<p class="note">{number(jobs)} jobs · misses: <b>{misses}</b>{"" if data.lockstep else named}
+<p class="note">{number(jobs)} jobs · misses: <b>{misses}</b>{blamed}
 · warm-up {number(timing.get("warmup_jobs"))} jobs, not in the figures</p></section>"""
 
 
@@ -140,15 +154,17 @@ def frames_table(frames: tuple[FrameStat, ...]) -> str:
             f'<td class="n">{number(f.cycle_ms)}</td><td class="n">{number(f.count)}</td>'
             f'<td class="n{" hot" if f.rate_ok is False else ""}">{number(f.rate_hz, 2)}</td>'
             f'<td class="n">{number(f.gap_min_ms, 2)}</td><td class="n">{number(f.gap_max_ms, 2)}</td>'
-            f'{_count(f.counter_gaps)}{_count(f.repeats)}{_count(f.crc_errors)}</tr>'
+            f"{_count(f.counter_gaps)}{_count(f.repeats)}{_count(f.crc_errors)}</tr>"
         )
     return f"""<section class="panel frames"><h2>Frames on the bus</h2><div class="scroll"><table>
-<thead><tr><th>id</th><th>message</th><th>sender</th><th class="n">cycle<small>DBC, ms</small></th><th class="n">frames</th>
-<th class="n">rate<small>Hz</small></th><th class="n">min gap<small>ms</small></th><th class="n">max gap<small>ms</small></th>
+<thead><tr><th>id</th><th>message</th><th>sender</th>
+<th class="n">cycle<small>DBC, ms</small></th><th class="n">frames</th>
+<th class="n">rate<small>Hz</small></th><th class="n">min gap<small>ms</small></th>
+<th class="n">max gap<small>ms</small></th>
 <th class="n">counter gaps</th><th class="n">E2E repeats</th><th class="n">E2E CRC</th></tr></thead>
 <tbody>{"".join(rows)}</tbody></table></div>
-<p class="note">gaps between receptions by the logger; the cycle of frames sent once per job is the loop's period; red: rate more
-than 5 % off the cycle, or an end-to-end (E2E) fault</p></section>"""
+<p class="note">gaps between receptions by the logger; the cycle of frames sent once per job is the loop's period;
+red: rate more than 5 % off the cycle, or an end-to-end (E2E) fault</p></section>"""
 
 
 def _count(value: int) -> str:
@@ -157,7 +173,12 @@ def _count(value: int) -> str:
 
 def identity(data: ReportData) -> str:
     """What ran and where: two lists."""
+
     def listing(title: str, pairs: tuple[tuple[str, str], ...]) -> str:
         rows = "".join(f'<dt>{esc(k)}</dt><dd class="mono">{esc(v)}</dd>' for k, v in pairs)
-        return f'<section class="panel"><h2>{title}</h2><dl class="kv">{rows or "<dt>nothing recorded</dt><dd></dd>"}</dl></section>'
-    return f'<div class="grid cols2">{listing("Identity", data.identity)}{listing("Environment", data.environment)}</div>'
+        rows = rows or "<dt>nothing recorded</dt><dd></dd>"
+        return f'<section class="panel"><h2>{title}</h2><dl class="kv">{rows}</dl></section>'
+
+    return (
+        f'<div class="grid cols2">{listing("Identity", data.identity)}{listing("Environment", data.environment)}</div>'
+    )

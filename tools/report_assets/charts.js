@@ -30,6 +30,12 @@ const Charts = (() => {
 
   /* The sample nearest to the cursor that this series really has; `undefined` only means "another series' time". */
   const nearest = (u, si, hovered) => {
+    const found = nearestSample(u, si, hovered), x = u.data[0];
+    // A mark far from the cursor says nothing about the place under it.
+    const far = found != null && u.series[si].marks && Math.abs(u.valToPos(x[found], "x") - u.cursor.left) > 6;
+    return far ? null : found;
+  };
+  const nearestSample = (u, si, hovered) => {
     const ys = u.data[si];
     if (hovered == null || ys[hovered] !== undefined) return hovered;
     let left = hovered, right = hovered;
@@ -64,7 +70,7 @@ const Charts = (() => {
 
   const seriesOptions = s => {
     const out = { label: s.label, scale: s.scale, show: true, spanGaps: false, points: { show: false } };
-    if (s.style === "marks") return { ...out, paths: (u, si) => drawMarks(u, si, s) };
+    if (s.style === "marks") return { ...out, marks: true, paths: (u, si) => drawMarks(u, si, s) };
     Object.assign(out, { width: s.width, stroke: () => css(s.colour), dash: s.dash || undefined });
     if (s.style === "steps") {
       out.paths = uPlot.paths.stepped({ align: 1 });
@@ -204,9 +210,7 @@ const Charts = (() => {
       head.textContent = xText(plot.data[0][idx], plot);
       rows.forEach(({ row, value }, i) => {
         const s = c.series[i], k = plot.cursor.idxs[i + 1], y = k == null ? null : plot.data[i + 1][k];
-        // A mark far from the cursor says nothing about the place under it.
-        const near = s.style !== "marks" || (k != null && Math.abs(plot.valToPos(plot.data[0][k], "x") - left) < 6);
-        row.hidden = !plot.series[i + 1].show || !near;
+        row.hidden = !plot.series[i + 1].show || (s.style === "marks" && k == null);
         value.textContent = show(y != null && y < s.zero_below ? 0 : y, s);
       });
       const right = left > plot.over.clientWidth / 2;
