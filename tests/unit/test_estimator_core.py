@@ -336,3 +336,19 @@ def test_any_frames_leave_a_sane_estimator(seed: int, setting: str, frames: int)
     first = tick % 65536 + 40_000
     outs = run(est, first, first + 1000)
     assert outs[-1].status == RUNNING
+
+
+@pytest.mark.parametrize(("start_s", "limit_w", "limit_r"), [(400.0, 0.25, 0.25), (520.0, 0.25, 0.25)])
+def test_hot_lap_accuracy(start_s: float, limit_w: float, limit_r: float) -> None:
+    """Started in the middle of a hot lap with an empty net: from 10 s on within 0.25 degC of the plant, raw above 1."""
+    from plant_sim.cycles import CycleSpec
+    from tools.check_estimator import check
+
+    w, r, data, core = check(library(), library().setting("default"), CycleSpec("lap"), start_s, 60.0, seed=4)
+    assert w.raw_rmse_degc > 1.0
+    assert w.est_rmse_degc <= limit_w
+    assert r.est_rmse_degc <= limit_r
+    assert w.first_10_s_max_degc < 1.5
+    assert len(data) >= 580
+    assert core.counters.restarts == 0
+    assert core.counters.unconverged == 0
