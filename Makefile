@@ -34,16 +34,16 @@ setup: $(VENV)/.base build
 CONFIGURE = $(VENV)/bin/cmake -S estimator_c -DPYTHON=$(CURDIR)/$(PY)
 build: $(VENV)/.base
 	@$(CONFIGURE) -B $(BUILD) --log-level=WARNING
-	@$(VENV)/bin/cmake --build $(BUILD) --parallel 2 -- --no-print-directory -s
+	@$(VENV)/bin/cmake --build $(BUILD) --parallel 2 -- --no-print-directory -s >$(BUILD)/build.log 2>&1 || { cat $(BUILD)/build.log >&2; exit 1; }
 
 build-asan: $(VENV)/.base
 	@$(CONFIGURE) -B $(BUILD)/asan -DSANITIZE=ON -DCMAKE_BUILD_TYPE=Debug --log-level=WARNING
-	@$(VENV)/bin/cmake --build $(BUILD)/asan --parallel 2 -- --no-print-directory -s
+	@$(VENV)/bin/cmake --build $(BUILD)/asan --parallel 2 -- --no-print-directory -s >$(BUILD)/asan/build.log 2>&1 || { cat $(BUILD)/asan/build.log >&2; exit 1; }
 
 # ---- the main job -----------------------------------------------------------------------------------------
 run: setup
 	@mkdir -p logs
-	$(RT) run hot-lap --log logs/hot-lap.mcap --json logs/hot-lap.json --force
+	$(RT) run hot-lap --log logs/hot-lap.mcap --json logs/hot-lap.json
 	$(RT) report logs/hot-lap.mcap -o logs/hot-lap.html
 
 # ---- proof ------------------------------------------------------------------------------------------------

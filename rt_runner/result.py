@@ -339,5 +339,5 @@ def _rms(errors: list[float]) -> float | None:
 
 
 def _quantiles(samples: list[float]) -> dict[str, float | None]:
-    ordered = sorted(samples)
+    ordered = sorted(round(x, 1) for x in samples)  # the bus's resolution: 0.1 us
     return {"p50": percentile(ordered, 50), "p99": percentile(ordered, 99), "max": ordered[-1] if ordered else None}

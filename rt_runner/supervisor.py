@@ -140,15 +140,24 @@ class Supervisor:
     def _watch(self, plant: Child, estimator: Child, logger: Child) -> None:
         """Until the plant is done; a child that ends before its time is an error."""
         while not self._stopped:
-            if plant.ended():
-                if plant.process.returncode != 0:
-                    raise ChildError(plant.obituary())
+            if self._plant_done(plant):
                 return
             for child in (estimator, logger):
                 if child.ended():
                     raise ChildError(child.obituary())
             self._drain(logger)
             time.sleep(0.05)
+
+    @staticmethod
+    def _plant_done(plant: Child) -> bool:
+        """Whether the plant has sent its last frame: it says so before it takes the time to end."""
+        while not plant.lines.empty():
+            line = plant.lines.get()
+            if line is None:
+                raise ChildError(plant.obituary())
+            if "final" in line:
+                return True
+        return False
 
     def _drain(self, logger: Child) -> None:
         while not logger.lines.empty():
