@@ -167,9 +167,7 @@ def _message_info(message: Message, path: str) -> MessageInfo:
     except ValueError:
         ids = b""
     if len(ids) != COUNTER_STATES:
-        raise DbcError(
-            f"{path}: message {message.name}: HilDataIdList {text!r} is not {COUNTER_STATES} bytes in hex"
-        )
+        raise DbcError(f"{path}: message {message.name}: HilDataIdList {text!r} is not {COUNTER_STATES} bytes in hex")
     crc, counter = (str(_attribute(message, f"Hil{s}Signal", path)) for s in ("Crc", "Counter"))
     places = {s.name: (s.start, s.length) for s in message.signals if s.byte_order == "little_endian"}
     if places.get(crc) != (0, 8) or places.get(counter) != (8, 4):

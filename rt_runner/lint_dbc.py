@@ -165,7 +165,7 @@ def not_available(db: Database) -> Iterator[tuple[str, str]]:
         low, high = raw_limits(s)
         wanted = low if s.is_signed else high
         if na is None and s.length >= 8 and s.unit:
-            yield where, f"a physical signal ({s.unit}) needs VAL_ {wanted} \"{NOT_AVAILABLE}\""
+            yield where, f'a physical signal ({s.unit}) needs VAL_ {wanted} "{NOT_AVAILABLE}"'
         elif na is not None and na != wanted:
             yield where, f"{NOT_AVAILABLE} is code {na}, the rule is {wanted}"
 

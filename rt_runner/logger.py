@@ -164,9 +164,7 @@ class Logger:
             return False
         # A float stamp is good to 0.2 us only; our own buses keep the kernel's integer beside it.
         t_ns = getattr(self._bus, "rx_ns", 0) or round(message.timestamp * 1e9)
-        decoded = self._writer.write(
-            t_ns, message.arbitration_id, bytes(message.data), _flags(message), message.dlc
-        )
+        decoded = self._writer.write(t_ns, message.arbitration_id, bytes(message.data), _flags(message), message.dlc)
         if self._first_ns is None:
             self._first_ns = t_ns
         self._now_ns = t_ns
@@ -201,9 +199,7 @@ class Logger:
             return RunFacts(stopped_by=stopped_by, crash=crash if stopped_by == "crash" else None, log_dropped=dropped)
         finish = told["finish"]
         facts = RunFacts.from_dict(finish.get("outcome") or {})
-        return replace(
-            facts, granted=finish.get("granted") or facts.granted, log_dropped=facts.log_dropped + dropped
-        )
+        return replace(facts, granted=finish.get("granted") or facts.granted, log_dropped=facts.log_dropped + dropped)
 
 
 def _flags(message: can.Message) -> int:
@@ -230,9 +226,7 @@ def _run(args: argparse.Namespace) -> None:
     control = Control()
     bus = open_bus(args.bus)
     try:
-        with LogWriter(
-            args.log, load_dbc(args.dbc), config.run, config.attachments, force=args.force
-        ) as writer:
+        with LogWriter(args.log, load_dbc(args.dbc), config.run, config.attachments, force=args.force) as writer:
             control.listen(sys.stdin.fileno())
             _say({"ready": True})
             result = Logger(bus, writer, control, _say).run()

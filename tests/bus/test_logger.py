@@ -100,9 +100,7 @@ def drive(count: int) -> list[can.Message]:
             for name, kind in (("TruthTemp", "true"), ("TempMeas", "meas")):
                 temperatures = {f"theta_w_{kind}_degc": 80.0, f"theta_r_{kind}_degc": 70.0}
                 frames.append(plant.encode(name, temperatures, tick=i))
-            frames.append(
-                estimator.encode("Estimate", status=2, theta_w_est_degc=80.5, theta_r_est_degc=69.5, tick=i)
-            )
+            frames.append(estimator.encode("Estimate", status=2, theta_w_est_degc=80.5, theta_r_est_degc=69.5, tick=i))
     return frames
 
 

@@ -43,9 +43,7 @@ def frames(count: int) -> Iterator[tuple[int, can.Message]]:
         speed = None if i % 50 == 7 else 100.0 * i
         yield t_ns, plant.encode("MotorState", derating_active=0, torque_nm=0.01 * i, speed_rpm=speed, tick=i)
         if i % 10 == 0:
-            yield t_ns, plant.encode(
-                "TempMeas", theta_w_meas_degc=80.0 + i / 64, theta_r_meas_degc=math.nan, tick=i
-            )
+            yield t_ns, plant.encode("TempMeas", theta_w_meas_degc=80.0 + i / 64, theta_r_meas_degc=math.nan, tick=i)
 
 
 def write(path: Path, count: int = 200, flush_every: int = 0) -> Path:
@@ -360,5 +358,3 @@ def test_the_lock_is_gone_with_the_writer(tmp_path):
     path = write(tmp_path / "a.mcap", 1)
     with path.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
