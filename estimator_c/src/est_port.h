@@ -12,7 +12,7 @@ typedef struct {
     int64_t drained_ns;  /* everything that arrived before this has been read */
 } est_port;
 
-/* Wraps an open port and tells a SocketCAN kernel which ids we want. Both objects stay with the caller and outlive the
+/* Wraps an open port, tells a SocketCAN kernel which ids we want, and gives a hub's socket room for a second of frames. Both objects stay with the caller and outlive the
  * result. Never fails: without the filter the cycle ignores foreign ids itself. */
 est_io est_port_io(est_port *self, can_port_t *port);
 
