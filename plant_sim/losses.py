@@ -61,10 +61,8 @@ class LossModel:
         self.params, self.dq_map, self.copper_m3 = params, dq_map, network.copper_m3
         g, m = params.geometry, params.material
         iron = m.rho_fe * g.stack_factor
-        split = 0.5 * (g.r_slot_bottom_m + g.r_stator_m)
         self.teeth_kg = iron * g.slots * g.tooth_width_m * (g.r_slot_bottom_m - g.r_bore_m) * g.stack_m
         self.yoke_kg = iron * pi * (g.r_stator_m**2 - g.r_slot_bottom_m**2) * g.stack_m
-        assert g.r_slot_bottom_m < split < g.r_stator_m
         slot_copper = g.slot_fill * g.slot_area_m2
         self.j_per_a = params.machine.turns_series * 6.0 / (g.slots * slot_copper) / sqrt(2.0)
         self.ac_volume_m3 = g.slots * slot_copper * g.stack_m

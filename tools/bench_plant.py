@@ -9,14 +9,15 @@ import numpy as np
 
 from plant_sim.cycles import CycleSpec, build_cycle
 from plant_sim.params import load_params
-from plant_sim.plant import Plant
+from plant_sim.plant import Engine, Plant
 
 
 def main() -> int:
     """Time single steps (as the process runs them) and bulk runs of both engines."""
     params = load_params()
     cycle = build_cycle(CycleSpec("lap"), params)
-    for engine, count in (("numba", 20_000), ("numpy", 2_000)):
+    counts: dict[Engine, int] = {"numba": 20_000, "numpy": 2_000}
+    for engine, count in counts.items():
         plant = Plant(params, cycle, engine=engine)
         plant.step()
         single = np.empty(count)
