@@ -1,7 +1,7 @@
 """python-can interface ``rt_hub``: the user-space hub, ``can.Bus(interface="rt_hub", channel=SOCKET_PATH)``.
 
 Registered as an entry point, so every python-can program works on the hub:
-``python -m can.logger -i rt_hub -c PATH``, ``cantools monitor -b rt_hub -c PATH dbc/drive.dbc``.
+``python -m can.logger -i rt_hub -c PATH``, ``cantools monitor -i rt_hub -c PATH dbc/drive.dbc``.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ def run(args) -> int:
     from rt_runner.errors import UsageError
     from rt_runner.present import write_json
 
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.-]{0,14}", args.name):
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.-]{0,14}", str(args.name)):
         raise UsageError(f"--name {args.name!r}: give an interface name such as vcan0")
     if args.action == "up":
         _up(args.name)

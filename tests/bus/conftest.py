@@ -20,6 +20,12 @@ def buses(request):
     if request.param == "hub":
         yield request.getfixturevalue("hub")
         return
+    yield request.getfixturevalue("vcan")
+
+
+@pytest.fixture
+def vcan():
+    """The real vcan0; mark the test with ``vcan``."""
     have_vcan()
     made = Buses("socketcan:vcan0", None)
     yield made
