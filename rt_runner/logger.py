@@ -12,6 +12,8 @@ import json
 import os
 import queue
 import signal
+import socket
+import struct
 import sys
 import threading
 import time
@@ -31,7 +33,9 @@ from rt_runner.result import ResultAccumulator, RunFacts
 FLUSH_S = 0.5
 PROGRESS_S = 1.0
 POLL_S = 0.05  # how long a wait for frames may hold up a control line or a flush
-DRAIN_QUIET_S, DRAIN_MAX_S = 0.2, 1.0
+DRAIN_QUIET_S, DRAIN_MAX_S = 0.2, 10.0
+DRAIN_LATER_NS = 300_000_000  # frames stamped later than this after the finish are no part of the run
+SO_MEMINFO, SK_MEMINFO_DROPS = 55, 8  # asm-generic/socket.h, linux/sock_diag.h; Python does not name them
 FINISH_WAIT_S = 10.0  # after the bus is lost: how long to wait to be told how the run ended
 _PROGRESS = ("theta_w_est_degc", "theta_w_true_degc", "resp_us")
 
@@ -104,6 +108,7 @@ class Logger:
     control : asked between frames
     say : takes one JSON-ready object for the supervisor
     clock : monotonic seconds
+    wall_ns : the clock of the receive stamps, ns UTC
     """
 
     def __init__(
@@ -113,7 +118,9 @@ class Logger:
         control: Control,
         say: Callable[[dict], None],
         clock: Callable[[], float] = time.monotonic,
+        wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
+        self._wall_ns = wall_ns
         self._bus, self._writer, self._control, self._say, self._clock = bus, writer, control, say, clock
         self._accumulator = ResultAccumulator()
         self._newest: dict[str, float | None] = {}
@@ -185,14 +192,22 @@ class Logger:
             self._say({"progress": {"t_s": round(t_s, 3), "frames": self._writer.frames, **shown}})
 
     def _drain(self) -> None:
-        """Take what is still on its way: until the bus is quiet, or for a second on one that never is."""
+        """Take what is still on its way: until the bus is quiet, or, on one that never is, up to now.
+
+        A logger that lags behind has frames waiting which the bus carried long ago: stamps decide, not our clock.
+        """
+        last_ns = self._wall_ns() + DRAIN_LATER_NS
         deadline = self._clock() + DRAIN_MAX_S
         with contextlib.suppress(can.CanError):
-            while self._clock() < deadline and self._take(DRAIN_QUIET_S):
-                pass
+            while self._take(DRAIN_QUIET_S) and self._now_ns < last_ns:
+                if self._clock() > deadline:
+                    self._say(
+                        {"error": f"{DRAIN_MAX_S:g} s were not enough to log what had arrived: frames are missing"}
+                    )
+                    return
 
     def _facts(self, told: dict) -> RunFacts:
-        dropped = int(getattr(self._bus, "rx_drops", 0))
+        dropped = _dropped(self._bus)
         if "finish" not in told:
             crash = told.get("why") or "the supervisor ended without finishing the run"
             stopped_by = told["stop"]
@@ -200,6 +215,20 @@ class Logger:
         finish = told["finish"]
         facts = RunFacts.from_dict(finish.get("outcome") or {})
         return replace(facts, granted=finish.get("granted") or facts.granted, log_dropped=facts.log_dropped + dropped)
+
+
+def _dropped(bus: can.BusABC) -> int:
+    """Frames the kernel dropped because we read too slowly.
+
+    The bus counts them when it receives the next frame; what was dropped after the last one only the socket knows.
+    """
+    seen = int(getattr(bus, "rx_drops", 0))
+    sock = getattr(bus, "socket", None)
+    try:
+        info = struct.unpack("=9I", sock.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 36))  # type: ignore[union-attr]
+    except (AttributeError, OSError, struct.error):
+        return seen
+    return max(seen, info[SK_MEMINFO_DROPS])
 
 
 def _flags(message: can.Message) -> int:
