@@ -48,7 +48,7 @@ typedef struct {
     int64_t deadline_ns;       /* 0 < D <= T */
     int64_t t0_ns;             /* r_0, before the first release */
     uint64_t warmup_releases;  /* releases 1..this are shown but not judged */
-    bool virtual_time;         /* lock-step: the caller names the release, there is no wake latency, nothing is skipped */
+    bool virtual_time;         /* lock-step: the caller names the release, there is no wake latency, nothing is late or skipped */
 } rt_task_config;
 
 /* One execution. `origin_ns` is what latencies count from: the release, or the start in virtual time. */
