@@ -17,7 +17,7 @@ import pytest
 from rt_runner.codec import Encoder
 from rt_runner.dbc import DEFAULT_DBC, load_dbc
 from rt_runner.log_reader import LogReader
-from tests.support.buses import ROOT, wait_until
+from tests.support.buses import ROOT, Buses, have_vcan, wait_until
 
 DBC = load_dbc()
 
@@ -225,6 +225,25 @@ def test_flood(buses, start, record_property):
     record_property("logger_cpu_us_per_frame", cpu_us)
     print(f"logger: {cpu_us:.1f} us of CPU per frame")
     assert cpu_us < 200, "5000 frames/s would not fit"
+
+
+@pytest.mark.vcan
+def test_frames_the_kernel_drops_are_counted(start, request):
+    """A logger that stands still loses frames on SocketCAN, at the very end as well; the result says how many."""
+    have_vcan()
+    buses = Buses("socketcan:vcan0", None)
+    request.addfinalizer(buses.close)
+    logger, sender = start(buses.bus), buses.open()
+    logger.process.send_signal(signal.SIGSTOP)
+    frames = drive(30000)
+    send(sender, frames)
+    logger.process.send_signal(signal.SIGCONT)
+    result = logger.finish()
+    assert logger.end() == (0, [])
+    missing = len(frames) - len(logged(logger.log))
+    assert missing > 0, "the socket held them all: send more"
+    assert result["log"]["dropped"] >= missing
+    assert result["verdict"] != "pass"
 
 
 def _newest_count(logger: LoggerProcess) -> int:
