@@ -69,7 +69,7 @@ class Supervisor:
             logger = self._start_logger(bus)
             try:
                 if bus.startswith("rt_hub:"):
-                    self._say(f"attach to it: cantools monitor dbc/drive.dbc -b rt_hub -c {bus.partition(':')[2]}")
+                    self._say(f"attach to it: cantools monitor dbc/drive.dbc -i rt_hub -c {bus.partition(':')[2]}")
                 return self._run_on(bus, logger)
             finally:
                 for child in reversed(self._children):

@@ -37,7 +37,7 @@ class LiveRun:
 
     def hub_path(self, timeout_s: float = 60) -> str:
         """The socket a stranger would attach to, as the run prints it."""
-        return self._wait(lambda: next((x.split("-c ")[1].split()[0] for x in self.lines if "-b rt_hub -c " in x), None), timeout_s)
+        return self._wait(lambda: next((x.split("-c ")[1].split()[0] for x in self.lines if "-i rt_hub -c " in x), None), timeout_s)
 
     def pid(self, needle: str, timeout_s: float = 60) -> int:
         """Process of this run whose command line contains ``needle``."""
