@@ -9,7 +9,7 @@ from typing import Any
 from rt_runner.e2e import COUNTER_MASK, E2eStatus
 from rt_runner.log_reader import LogReader
 
-RATE_TOLERANCE = 0.05  # a mean period further off its cycle than this is pointed out
+RATE_TOLERANCE = 0.05  # a period further off its cycle than this is pointed out
 MIN_PERIODS = 5  # ... once there are this many periods to judge
 
 
@@ -35,10 +35,15 @@ class MessageSummary:
 
     @property
     def rate_ok(self) -> bool | None:
-        """Whether the mean period is that of the DBC; None where it cannot be judged."""
-        if self.mean_ms is None or self.frames <= MIN_PERIODS:
+        """Whether the mean period is that of the DBC; None where it cannot be judged.
+
+        The shortest and the longest period are left out: last words at the end of a run, one frame lost.
+        """
+        if self.mean_ms is None or self.min_ms is None or self.max_ms is None or self.frames <= MIN_PERIODS:
             return None
-        return abs(self.mean_ms - self.cycle_ms) <= RATE_TOLERANCE * self.cycle_ms
+        periods = self.frames - 1
+        mean_ms = (self.mean_ms * periods - self.min_ms - self.max_ms) / (periods - 2)
+        return abs(mean_ms - self.cycle_ms) <= RATE_TOLERANCE * self.cycle_ms
 
 
 @dataclass

@@ -164,3 +164,15 @@ def test_a_cut_log_is_shown_and_called_so(tmp_path):
     assert len(ran.stderr.splitlines()) == 1
     assert f"{tmp_path / 'cut.mcap'}: the log was never finished" in ran.stderr
     assert "MotorState" in ran.stdout
+
+
+def test_last_words_do_not_make_a_rate_wrong(tmp_path):
+    """Counters come once a second, and once more when the estimator ends."""
+    estimator = Encoder(DBC, "ESTIMATOR")
+    with LogWriter(tmp_path / "a.mcap", DBC) as log:
+        for t_ms in (0, 1000, 2000, 3000, 4000, 5000, 5010):
+            frame = estimator.encode("EstReleases", releases=1, jobs=1)
+            log.write(T0_NS + t_ms * 1_000_000, frame.arbitration_id, frame.data)
+    counters = next(m for m in summarise(tmp_path / "a.mcap").messages if m.name == "EstReleases")
+    assert counters.mean_ms == pytest.approx(5010 / 6)
+    assert counters.rate_ok is True
