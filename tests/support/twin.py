@@ -80,7 +80,7 @@ def twin_estimates(lib: Lib, weights: LstmWeights, setting: Setting, rec: Record
                     frames.append(rec.motor[tick + since])
                 else:
                     continue
-                u = np.array([np.mean([f[1] for f in frames]), np.mean([f[0] for f in frames])])
+                u = np.array([np.mean([f[1] for f in frames]), np.mean([f[0] for f in frames])], dtype=np.float64)
                 rate = lstm_step(weights, np.concatenate([u, theta]), c, h)[2]
                 published[tick + since] = theta + 0.01 * since * rate
             else:
