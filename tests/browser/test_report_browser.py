@@ -26,7 +26,7 @@ RUNS = {
 
 def _chromium_runs() -> str | None:
     """None if the browser can be started, else why not."""
-    done = subprocess.run([SCREENSHOT, "--check"], capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, SCREENSHOT, "--check"], capture_output=True, text=True, check=False)
     return None if done.returncode == 0 else done.stderr.strip()
 
 
@@ -123,6 +123,7 @@ def test_reactions(tmp_path):
     assert int(told["readouts"]) == 6  # all time charts; the histogram has its own axis
     assert "truth" in told["first"]
     assert "°C" in told["first"]
+    assert "settling" in told["first"]
     shown = [float(x) for x in re.findall(r"[\d.]+", told["zoomed"])]
     assert shown[1] - shown[0] < 10
     assert told["reset"] == told["whole"]
@@ -136,10 +137,10 @@ def test_themes_and_narrow_screen(tmp_path):
     corner = {}
     for theme, options in {"light": (), "dark": ("--dark",)}.items():
         out = tmp_path / f"{theme}.png"
-        shoot(page, out, "--height", "700", *options)
+        shoot(page, out, "--height", "400", *options)
         rows = pixels(out)
         corner[theme] = sum(rows[2][:3])
-        assert len({rows[y][x : x + 3] for y in range(0, 700, 7) for x in range(0, 3840, 21)}) > 8
+        assert len({rows[y][x : x + 3] for y in range(0, 300, 7) for x in range(0, 3840, 21)}) > 8
     assert corner["light"] > 700
     assert corner["dark"] < 120
     frame, dom = tmp_path / "frame.html", tmp_path / "dom.html"

@@ -107,7 +107,7 @@ def _error_chart(name: str, title: str, node: Temperature, data: ReportData) -> 
         "height": 180,
         "x": _time_axis(data),
         "spans": _spans(data),
-        "note": "at the same plant tick: the sensor's offset, noise and delay all count",
+        "note": "at the same plant tick, so delay counts; hide the sensor in the legend to enlarge",
         "y": [{"scale": "k", "label": "error (K)", "unit": "K", "zero": True, "min_span": 0.2}],
         "series": [
             *_line(node.sensor_error, "sensor − truth", "K", "k", "--sensor", 3, width=1),

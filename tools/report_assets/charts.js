@@ -207,7 +207,9 @@ const Charts = (() => {
       const { idx, left } = plot.cursor;
       box.hidden = idx == null || left < 0;
       if (box.hidden) return;
-      head.textContent = xText(plot.data[0][idx], plot);
+      const at = plot.posToVal(left, "x");
+      const inside = (c.spans || []).filter(span => span.t0 <= at && at <= span.t1).map(span => " · " + span.label);
+      head.textContent = xText(plot.data[0][idx], plot) + inside.join("");
       rows.forEach(({ row, value }, i) => {
         const s = c.series[i], k = plot.cursor.idxs[i + 1], y = k == null ? null : plot.data[i + 1][k];
         row.hidden = !plot.series[i + 1].show || (s.style === "marks" && k == null);
