@@ -8,7 +8,7 @@ import struct
 
 from google.protobuf import descriptor_pb2
 
-from rt_runner.dbc import Dbc, MessageInfo
+from rt_runner.dbc import MessageInfo
 
 PACKAGE = "rt"
 RAW_SCHEMA = f"{PACKAGE}.CanFrame"
@@ -123,8 +123,3 @@ def channel_metadata(info: MessageInfo) -> dict[str, str]:
         "simulation_only": str(int(info.simulation_only)),
         "units": ",".join(f"{s.name}={s.unit}" for s in info.signals if s.unit),
     }
-
-
-def serializers(dbc: Dbc) -> dict[str, FrameSerializer]:
-    """One serializer per message of the DBC."""
-    return {m.name: FrameSerializer(m) for m in dbc}
