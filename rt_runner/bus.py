@@ -226,10 +226,9 @@ class HubProcess:
         try:
             yield hub.bus
         finally:
-            lost = hub.ended()
             counters = hub.stop()
             if say is not None and hub.child is not None:
-                if lost:
+                if not counters:  # it did not live to say them
                     say(f"error: {hub.child.obituary()}")
                 elif counters.get("stalled"):
                     say(f"warning: hub: {hub.child.last_words()}")

@@ -1,7 +1,9 @@
 """The hub as a process: what it does with clients that misbehave, with its socket, and at its end."""
 
+import fcntl
 import json
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -237,6 +239,20 @@ def test_two_hubs_started_at_once_do_not_take_each_others_socket(tmp_path):
                 p.terminate()
             out, err = p.communicate(timeout=20)
             assert p.returncode == (0 if line else 1), (out, err)
+
+
+def test_a_starting_hub_waits_for_another_that_is_starting(tmp_path):
+    """Both look whether the socket is stale under a lock of its folder."""
+    folder = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(folder, fcntl.LOCK_EX)
+    with subprocess.Popen([build("estimator_c/apps/rt_hub.c"), "--socket", tmp_path / "bus"], text=True,
+                          stdout=subprocess.PIPE) as p:  # fmt: skip
+        assert select.select([p.stdout], [], [], 0.5)[0] == []
+        fcntl.flock(folder, fcntl.LOCK_UN)
+        assert '"ready":true' in p.stdout.readline()
+        p.terminate()
+        assert p.wait(20) == 0
+    os.close(folder)
 
 
 def test_a_full_table_refuses_politely(hub):
