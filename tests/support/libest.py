@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes as ct
 import hashlib
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -88,6 +90,8 @@ def compile_library(weights: Path, flags: tuple[str, ...] = ("-O2",)) -> Path:
     library = out / "libestimator.so"
     if library.exists():
         return library
+    if not folder.exists():
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
     generated = generate(weights, SETTINGS, out)
     base = ROOT / "estimator_c"
     command = ["gcc", "-std=c11", "-D_GNU_SOURCE", "-g", "-fPIC", "-shared", "-fno-math-errno", *flags]
