@@ -33,11 +33,11 @@ setup: $(VENV)/.base build
 # ---- C: generate, then compile ----------------------------------------------------------------------------
 CONFIGURE = $(VENV)/bin/cmake -S estimator_c -DPYTHON=$(CURDIR)/$(PY)
 build: $(VENV)/.base
-	@$(CONFIGURE) -B $(BUILD) --log-level=WARNING
+	@$(CONFIGURE) -B $(BUILD) --log-level=WARNING >/dev/null
 	@$(VENV)/bin/cmake --build $(BUILD) --parallel 2 -- --no-print-directory -s >$(BUILD)/build.log 2>&1 || { cat $(BUILD)/build.log >&2; exit 1; }
 
 build-asan: $(VENV)/.base
-	@$(CONFIGURE) -B $(BUILD)/asan -DSANITIZE=ON -DCMAKE_BUILD_TYPE=Debug --log-level=WARNING
+	@$(CONFIGURE) -B $(BUILD)/asan -DSANITIZE=ON -DCMAKE_BUILD_TYPE=Debug --log-level=WARNING >/dev/null
 	@$(VENV)/bin/cmake --build $(BUILD)/asan --parallel 2 -- --no-print-directory -s >$(BUILD)/asan/build.log 2>&1 || { cat $(BUILD)/asan/build.log >&2; exit 1; }
 
 # ---- the main job -----------------------------------------------------------------------------------------

@@ -30,8 +30,10 @@ def make_plant(scenario: Scenario, seed: int) -> Plant:
     cycle, sensor = scenario.cycle, scenario.sensor
     path = str(scenario.path.parent / cycle.path) if cycle.path else None
     params = load_params()
-    params = replace(params, sensor=replace(params.sensor, mean_k=sensor.offset_degc, variance_k2=sensor.variance,
-                                            delay_s=sensor.delay_s))
+    params = replace(
+        params,
+        sensor=replace(params.sensor, mean_k=sensor.offset_degc, variance_k2=sensor.variance, delay_s=sensor.delay_s),
+    )
     plant = Plant(params, CycleSpec(kind=cycle.kind, path=path, theta0_degc=cycle.theta0_degc), seed=seed)
     plant.advance(cycle.start_s)
     return plant
@@ -77,9 +79,18 @@ def run_realtime(args) -> int:
                 if sample.done or (count % 10 == 0 and _stdin_closed()):
                     break
         except can.CanOperationError as e:
-            raise SetupError(f"bus {args.bus} was lost at tick {plant.tick}: {e}; see the other processes' last words") from e
-        _say({"final": True, "ticks": count, "ticks_late": publisher.ticks_late, "late_max_ms": publisher.late_max_ms,
-              "tx_retries": publisher.tx_retries})
+            raise SetupError(
+                f"bus {args.bus} was lost at tick {plant.tick}: {e}; see the other processes' last words"
+            ) from e
+        _say(
+            {
+                "final": True,
+                "ticks": count,
+                "ticks_late": publisher.ticks_late,
+                "late_max_ms": publisher.late_max_ms,
+                "tx_retries": publisher.tx_retries,
+            }
+        )
     return 0
 
 
@@ -117,7 +128,7 @@ def run_lockstep(args, inp: BinaryIO, out: BinaryIO) -> int:
             sample = plant.step()
             t_ns = (sample.tick - first) * TICK_NS
             for message in publisher.frames(sample):
-                chunk += pack(t_ns, message.arbitration_id, message.data)
+                chunk += pack(t_ns, message.arbitration_id, bytes(message.data))
             done = sample.done or (ticks > 0 and sample.tick - first >= ticks)
             if done:
                 break

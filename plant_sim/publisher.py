@@ -27,21 +27,32 @@ class Publisher:
     def frames(self, s: PlantSample) -> list[can.Message]:
         """Frames due at this tick, in the order they are to be sent."""
         tick = s.tick % 65536
-        out = [self._encode("MotorState", {
-            "torque_nm": s.torque_nm, "speed_rpm": s.speed_rpm, "derating_active": 0, "tick": tick})]
+        out = [
+            self._encode(
+                "MotorState", {"torque_nm": s.torque_nm, "speed_rpm": s.speed_rpm, "derating_active": 0, "tick": tick}
+            )
+        ]
         first, self._first_tick = self._first_tick is None, self._first_tick or s.tick
         if s.tick % 10 == 0:
             out += [
-                self._encode("TempMeas", {"theta_w_meas_degc": s.theta_w_meas_degc,
-                                          "theta_r_meas_degc": s.theta_r_meas_degc, "tick": tick}),
+                self._encode(
+                    "TempMeas",
+                    {"theta_w_meas_degc": s.theta_w_meas_degc, "theta_r_meas_degc": s.theta_r_meas_degc, "tick": tick},
+                ),
                 self._encode("Reference", {"speed_demand_mps": s.v_ref_mps, "slope_rad": s.slope_rad, "tick": tick}),
-                self._encode("TruthTemp", {"theta_w_true_degc": s.theta_w_degc,
-                                           "theta_r_true_degc": s.theta_r_degc, "tick": tick}),
+                self._encode(
+                    "TruthTemp",
+                    {"theta_w_true_degc": s.theta_w_degc, "theta_r_true_degc": s.theta_r_degc, "tick": tick},
+                ),
                 self._encode("TruthVehicle", {"v_true_mps": s.v_mps, "distance_m": s.x_m, "tick": tick}),
             ]
         if (s.tick - self._first_tick) % 100 == 0:
-            out.append(self._encode("PlantStatus", {
-                "ticks_late": self.ticks_late, "late_max_ms": self.late_max_ms, "tx_retries": self.tx_retries}))
+            out.append(
+                self._encode(
+                    "PlantStatus",
+                    {"ticks_late": self.ticks_late, "late_max_ms": self.late_max_ms, "tx_retries": self.tx_retries},
+                )
+            )
         if first or (s.tick - self._first_tick) % 1000 == 0:
             out.append(self._encode("PlantIdentity", self._identity))
         return out

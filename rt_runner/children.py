@@ -45,12 +45,20 @@ class Child:
 
         try:
             # A session of its own: Ctrl-C reaches the supervisor alone, which then ends the others in order.
-            self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                                            stderr=subprocess.PIPE, start_new_session=True, preexec_fn=in_child)
+            self.process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                start_new_session=True,
+                preexec_fn=in_child,
+            )
         except OSError as e:
             raise SetupError(f"cannot start the {name}: {command[0]}: {e.strerror}") from e
-        self._readers = [threading.Thread(target=self._read_stdout, daemon=True),
-                         threading.Thread(target=self._read_stderr, daemon=True)]
+        self._readers = [
+            threading.Thread(target=self._read_stdout, daemon=True),
+            threading.Thread(target=self._read_stderr, daemon=True),
+        ]
         for reader in self._readers:
             reader.start()
 
@@ -89,7 +97,9 @@ class Child:
                 line = self.lines.get(timeout=0.05)
             except queue.Empty:
                 if time.monotonic() > deadline:
-                    raise ChildError(f"the {self.name} did not answer within {timeout_s:g} s: {self.last_words()}") from None
+                    raise ChildError(
+                        f"the {self.name} did not answer within {timeout_s:g} s: {self.last_words()}"
+                    ) from None
                 continue
             if line is None:
                 raise ChildError(self.obituary())

@@ -21,8 +21,11 @@ class _Parser(argparse.ArgumentParser):
 
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line; nothing heavy is imported for it."""
-    parser = _Parser(prog="rt-runner", description="Real-time runner over CAN: plant, estimator, logs you can trust.",
-                     epilog="exit status: 0 pass, 1 usage or set-up, 2 limits not met, 3 inconclusive")
+    parser = _Parser(
+        prog="rt-runner",
+        description="Real-time runner over CAN: plant, estimator, logs you can trust.",
+        epilog="exit status: 0 pass, 1 usage or set-up, 2 limits not met, 3 inconclusive",
+    )
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB", parser_class=_Parser)
     for verb in VERBS:

@@ -1,4 +1,4 @@
-"""Scenarios: one TOML file says what is driven, sensed, estimated and demanded. Refused here, before anything starts."""
+"""Scenarios: one TOML file says what is driven, sensed and demanded. What cannot be is refused here, before a start."""
 
 import hashlib
 import math
@@ -71,8 +71,10 @@ def load_scenario(name_or_path: str) -> Scenario:
     if name_or_path.endswith(".toml") or "/" in name_or_path:
         path = Path(name_or_path)
     elif not path.is_file():
-        raise UsageError(f"unknown scenario '{name_or_path}': choose one of {', '.join(scenario_names())}, "
-                         "or give the path of a .toml file")
+        raise UsageError(
+            f"unknown scenario '{name_or_path}': choose one of {', '.join(scenario_names())}, "
+            "or give the path of a .toml file"
+        )
     try:
         raw = path.read_bytes()
         tree = tomllib.loads(raw.decode())
@@ -105,8 +107,9 @@ def _table(cls, values: dict, where: str):
     for key in values:
         if key not in known:
             raise UsageError(f"{where}: unknown key '{key}' (known: {', '.join(known)})")
-    return cls(**{k: _typed(v, str if k in ("kind", "path", "setting") else float, f"{where} {k}")
-                  for k, v in values.items()})
+    return cls(
+        **{k: _typed(v, str if k in ("kind", "path", "setting") else float, f"{where} {k}") for k, v in values.items()}
+    )
 
 
 def _typed(value, want: type, where: str):

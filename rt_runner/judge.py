@@ -102,8 +102,11 @@ def judge_misses(misses: int, by_machine: int, releases: int, limit: float) -> F
         return Finding("miss rate", "inconclusive", says + hint)
     own_lower, _ = miss_rate_bounds(misses - by_machine, releases)
     if own_lower <= limit:
-        return Finding("miss rate", "inconclusive",
-                       f"{says}; {by_machine} of them were woken late or preempted: the machine was taken from us")
+        return Finding(
+            "miss rate",
+            "inconclusive",
+            f"{says}; {by_machine} of them were woken late or preempted: the machine was taken from us",
+        )
     return Finding("miss rate", "fail", f"{says}; proven above it, rate > {lower:.2%}")
 
 

@@ -26,8 +26,9 @@ class _Peer:
     def __init__(self, name: str, command: list[str]) -> None:
         self.name = name
         self._words: list[str] = []
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                                        start_new_session=True)  # Ctrl-C is ours to handle
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+        )  # Ctrl-C is ours to handle
 
     def exchange(self, chunk: bytes) -> list[Record]:
         """Send ``chunk``, which ends with a control record, and read up to the answering control record."""
@@ -66,8 +67,8 @@ class _Peer:
         """One line on how it ended."""
         for _ in self.json_lines():
             pass
-        words = [w for w in self._words if w]
-        return f"the {self.name} ended with exit status {self.process.wait()}; its last words: {words[-1] if words else '(none)'}"
+        words = [w for w in self._words if w] or ["(it said nothing)"]
+        return f"the {self.name} ended with exit status {self.process.wait()}; its last words: {words[-1]}"
 
     def close(self) -> None:
         """End it, whatever it is doing."""
@@ -96,14 +97,36 @@ def run_lockstep(scenario: Scenario, seed: int, log: Path, progress: Callable[[d
         A process ended early; the log up to there is complete and readable.
     """
     dbc = load_dbc()
-    plant_command = [sys.executable, "-m", "plant_sim", "--lockstep", "--scenario", str(scenario.path), "--seed", str(seed)]
+    plant_command = [
+        sys.executable,
+        "-m",
+        "plant_sim",
+        "--lockstep",
+        "--scenario",
+        str(scenario.path),
+        "--seed",
+        str(seed),
+    ]
     if scenario.duration_s:
         plant_command += ["--duration", str(scenario.duration_s)]
-    estimator_command = [str(paths.binary("rt_estimator")), "--lockstep", "--setting", scenario.estimator.setting,
-                         "--period-us", str(round(scenario.estimator.period_s * 1e6)), "--no-rt"]
+    estimator_command = [
+        str(paths.binary("rt_estimator")),
+        "--lockstep",
+        "--setting",
+        scenario.estimator.setting,
+        "--period-us",
+        str(round(scenario.estimator.period_s * 1e6)),
+        "--no-rt",
+    ]
     config = log_config(scenario, "lockstep", seed)
-    facts = RunFacts(bus="lockstep", scenario=scenario.name, period_s=scenario.estimator.period_s, lockstep=True,
-                     seed=seed, limits=scenario.limits)
+    facts = RunFacts(
+        bus="lockstep",
+        scenario=scenario.name,
+        period_s=scenario.estimator.period_s,
+        lockstep=True,
+        seed=seed,
+        limits=scenario.limits,
+    )
     accumulator = ResultAccumulator()
     peers: list[_Peer] = []
     try:

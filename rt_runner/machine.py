@@ -30,5 +30,9 @@ def steal_ms(core: int) -> float | None:
 
 def describe() -> dict[str, str]:
     """Facts for the log's ``run`` metadata."""
-    return {"kernel": platform.release(), "machine": platform.machine(), "python": platform.python_version(),
-            "cores": ",".join(map(str, sorted(os.sched_getaffinity(0))))}
+    return {
+        "kernel": platform.release(),
+        "machine": platform.machine(),
+        "python": platform.python_version(),
+        "cores": ",".join(map(str, sorted(os.sched_getaffinity(0)))),
+    }

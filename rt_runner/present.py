@@ -92,19 +92,31 @@ def summary(result: dict, log: Path | None) -> str:
         a = result["accuracy"][channel]
         if a["est_rmse_degc"] is not None:
             raw = "n/a" if a["raw_rmse_degc"] is None else f"{a['raw_rmse_degc']:.3f}"
-            lines.append(f"{title:<10} estimate RMSE {a['est_rmse_degc']:.3f} degC (max {a['est_max_degc']:.3f}), "
-                         f"raw sensor {raw} degC")
+            lines.append(
+                f"{title:<10} estimate RMSE {a['est_rmse_degc']:.3f} degC (max {a['est_max_degc']:.3f}), "
+                f"raw sensor {raw} degC"
+            )
     t = result["timing"]["estimator"]
-    lines.append(f"{'jobs':<10} {t['jobs']} at {t['period_s'] * 1e3:g} ms, {t['miss_late']} late, {t['miss_skipped']} skipped")
+    lines.append(
+        f"{'jobs':<10} {t['jobs']} at {t['period_s'] * 1e3:g} ms, {t['miss_late']} late, {t['miss_skipped']} skipped"
+    )
     for key, title in (("wake_lat_us", "wake-up"), ("exec_wall_us", "execution"), ("resp_us", "response")):
         q = t[key]
         if q["max"] is not None:
-            lines.append(f"{title:<10} " + ", ".join(
-                f"{k} {'n/a' if q[k] is None else format(q[k], '.1f')}" for k in ("p50", "p99", "max")) + " us")
+            lines.append(
+                f"{title:<10} "
+                + ", ".join(f"{k} {'n/a' if q[k] is None else format(q[k], '.1f')}" for k in ("p50", "p99", "max"))
+                + " us"
+            )
     g = result["granted"]
     if g["policy"] is not None:
-        lines.append(f"{'granted':<10} {g['policy']}, core {g['core']}, memory {'locked' if g['mlock'] else 'not locked'}")
-    lines.append(f"{'log':<10} {result['log']['frames']} frames, {result['log']['dropped']} dropped" + (f", {log}" if log else ""))
+        lines.append(
+            f"{'granted':<10} {g['policy']}, core {g['core']}, memory {'locked' if g['mlock'] else 'not locked'}"
+        )
+    lines.append(
+        f"{'log':<10} {result['log']['frames']} frames, {result['log']['dropped']} dropped"
+        + (f", {log}" if log else "")
+    )
     for f in result["findings"]:
         lines.append(f"{f['verdict']:<12} {f['what']}: {f['evidence']}")
     lines.append(f"verdict: {result['verdict']}")

@@ -1,8 +1,8 @@
-"""Lock-step records: a CAN frame and its time, 24 bytes, over a pipe. The same bytes in Python and in C (rt_record.h)."""
+"""Lock-step records: a CAN frame and its time, 24 bytes, over a pipe. The same bytes as in C (rt_record.h)."""
 
 import struct
 from collections.abc import Iterator
-from typing import BinaryIO, NamedTuple
+from typing import IO, NamedTuple
 
 RECORD = struct.Struct("=qIB3x8s")  # t_ns, then struct can_frame: id, length, padding, data
 CONTROL_ID = 0x20000000  # CAN_ERR_FLAG: no data frame can have it
@@ -27,7 +27,7 @@ def control(t_ns: int, code: int) -> bytes:
     return pack(t_ns, CONTROL_ID, bytes([code]))
 
 
-def read_until_control(stream: BinaryIO) -> Iterator[Record]:
+def read_until_control(stream: IO[bytes]) -> Iterator[Record]:
     """Records up to and including the next control record.
 
     Raises

@@ -99,10 +99,10 @@ class ResultAccumulator:
         self._release = Unwrapper(RELEASE_BITS)
         self._releases: list[int] = []
         self._late = self._warmup_jobs = self._warmup_misses = self._stale_jobs = 0
-        self._causes = dict.fromkeys(CAUSES, 0)
-        self._skips_by_cause = dict.fromkeys(CAUSES, 0)
+        self._causes: dict[str, int] = dict.fromkeys(CAUSES, 0)
+        self._skips_by_cause: dict[str, int] = dict.fromkeys(CAUSES, 0)
         self._skipped = 0
-        self._in_warmup = False
+        self._in_warmup = self._was_late = False
         self._wake_us: list[float] = []
         self._exec_us: list[float] = []
         self._resp_us: list[float] = []
@@ -186,7 +186,9 @@ class ResultAccumulator:
     def _errors(self, trace: _Trace, channel: str, from_tick: int) -> list[float]:
         out = []
         for tick, theta in zip(trace.tick, getattr(trace, channel), strict=True):
-            true = self._true_at(tick, channel) if theta is not None and tick >= from_tick else None
+            if theta is None or tick < from_tick:
+                continue
+            true = self._true_at(tick, channel)
             if true is not None:
                 out.append(theta - true)
         return out
@@ -198,8 +200,10 @@ class ResultAccumulator:
         start = self._first_estimate_tick + round(SETTLE_S / TICK_S)
         raw, est = (self._errors(t, channel, start) for t in (self._sensor, self._estimate))
         return {
-            "raw_rmse_degc": _rms(raw), "est_rmse_degc": _rms(est),
-            "est_max_degc": max(map(abs, est)) if est else None, "samples": len(est),
+            "raw_rmse_degc": _rms(raw),
+            "est_rmse_degc": _rms(est),
+            "est_max_degc": max(map(abs, est)) if est else None,
+            "samples": len(est),
         }
 
     # ---- timing ---------------------------------------------------------------------------------------
@@ -214,6 +218,7 @@ class ResultAccumulator:
             self._skips_by_cause[self._last_cause] += skipped
         self._releases.append(release)
         self._late += late
+        self._was_late = late
         self._stale_jobs += bool(v.get("stale_input"))
         self._in_warmup = warmup
         self._warmup_jobs += warmup
@@ -224,7 +229,7 @@ class ResultAccumulator:
     def _on_EstTimingB(self, v: dict) -> None:
         cause = v.get("miss_cause")
         self._last_cause = CAUSES[int(cause)] if cause is not None and int(cause) < len(CAUSES) else "none"
-        self._causes[self._last_cause] += 1
+        self._causes[self._last_cause] += self._was_late  # a job in time may name a cause (stale input), too
         if self._in_warmup:
             return
         for key, into in (("exec_wall_us", self._exec_us), ("resp_us", self._resp_us)):
@@ -247,8 +252,12 @@ class ResultAccumulator:
         accuracy = {c: self._accuracy(f"{c}_degc") for c in ("theta_w", "theta_r")}
         span_s = (self._last_ns - self._first_ns) / 1e9 if self._first_ns is not None else 0.0
         dropped = self._lost + facts.log_dropped
-        findings = [*self._judge_run(facts), *self._judge_accuracy(accuracy, facts.limits),
-                    *self._judge_timing(facts), self._judge_log(dropped)]
+        findings = [
+            *self._judge_run(facts),
+            *self._judge_accuracy(accuracy, facts.limits),
+            *self._judge_timing(facts),
+            self._judge_log(dropped),
+        ]
         jobs = len(self._releases)
         return {
             "verdict": overall(findings),
@@ -258,25 +267,31 @@ class ResultAccumulator:
             "seed": facts.seed,
             "duration_s": round(facts.duration_s if facts.duration_s is not None else span_s, 3),
             "accuracy": accuracy,
-            "timing": {"estimator": {
-                "period_s": facts.period_s,
-                "jobs": jobs,
-                "releases": jobs + self._skipped,
-                "warmup_jobs": self._warmup_jobs,
-                "miss_late": self._late,
-                "miss_skipped": self._skipped,
-                "stale_jobs": self._stale_jobs,
-                "causes": {k: n for k, n in self._causes.items() if n and k != "none"},
-                "wake_lat_us": _quantiles(self._wake_us),
-                "exec_wall_us": _quantiles(self._exec_us),
-                "resp_us": _quantiles(self._resp_us),
-            }},
+            "timing": {
+                "estimator": {
+                    "period_s": facts.period_s,
+                    "jobs": jobs,
+                    "releases": jobs + self._skipped,
+                    "warmup_jobs": self._warmup_jobs,
+                    "miss_late": self._late,
+                    "miss_skipped": self._skipped,
+                    "stale_jobs": self._stale_jobs,
+                    "causes": {
+                        k: n + self._skips_by_cause[k] for k, n in self._causes.items() if n + self._skips_by_cause[k]
+                    },
+                    "wake_lat_us": _quantiles(self._wake_us),
+                    "exec_wall_us": _quantiles(self._exec_us),
+                    "resp_us": _quantiles(self._resp_us),
+                }
+            },
             "granted": {k: facts.granted.get(k) for k in ("policy", "core", "mlock")},
             "environment": {"steal_ms": facts.steal_ms, "warnings": facts.granted.get("warnings", [])},
             "input_faults": {k: self._count("EstInputFaults", k) for k in ("crc_errors", "seq_errors", "stale_inputs")},
             "bus_faults": {k: self._count("EstBusFaults", k) for k in ("rx_drops", "tx_drops", "rejected")},
-            "plant": {"ticks_late": self._count("PlantStatus", "ticks_late"),
-                      "late_max_ms": self._last.get("PlantStatus", {}).get("late_max_ms")},
+            "plant": {
+                "ticks_late": self._count("PlantStatus", "ticks_late"),
+                "late_max_ms": self._last.get("PlantStatus", {}).get("late_max_ms"),
+            },
             "log": {"frames": self._frames, "dropped": dropped, "damaged": self._damaged},
         }
 
@@ -291,17 +306,25 @@ class ResultAccumulator:
         if self._first_estimate_tick is None:
             return [Finding("accuracy", "inconclusive", "no estimate with a temperature is in the log")]
         if not self._truth.tick:
-            return []  # a real motor has no truth; nothing to judge
+            return [Finding("accuracy", "pass", "no truth on this bus: nothing to compare with, not judged")]
         out = []
         for channel, limit in (("theta_w", limits.theta_w_rmse_max_degc), ("theta_r", limits.theta_r_rmse_max_degc)):
             rmse = accuracy[channel]["est_rmse_degc"]
             if rmse is None:
-                out.append(Finding(f"{channel} accuracy", "inconclusive",
-                                   f"nothing logged later than {SETTLE_S:g} s after the first estimate: run longer"))
+                out.append(
+                    Finding(
+                        f"{channel} accuracy",
+                        "inconclusive",
+                        f"nothing logged later than {SETTLE_S:g} s after the first estimate: run longer",
+                    )
+                )
             else:
                 good = rmse <= limit
-                out.append(Finding(f"{channel} accuracy", "pass" if good else "fail",
-                                   f"RMSE {rmse:.3f} degC, limit {limit:g} degC"))
+                out.append(
+                    Finding(
+                        f"{channel} accuracy", "pass" if good else "fail", f"RMSE {rmse:.3f} degC, limit {limit:g} degC"
+                    )
+                )
         return out
 
     def _judge_timing(self, facts: RunFacts) -> list[Finding]:
@@ -314,23 +337,38 @@ class ResultAccumulator:
             out.append(judge_misses(min(misses, releases), by_machine, max(releases, 0), facts.limits.miss_rate_max))
         counted = self._last.get("EstReleases", {})
         if counted.get("releases") is not None and jobs:
-            own_jobs, own_releases = int(counted["jobs"] or 0), int(counted["releases"])
+            own_jobs, own_releases = self._count("EstReleases", "jobs"), self._count("EstReleases", "releases")
             own_skipped = self._count("EstMisses", "miss_skipped")
             # The counters were sent once a second; jobs logged since then are the difference, never a deficit.
             if own_releases != own_jobs + own_skipped:
-                out.append(Finding("conservation", "fail",
-                                   f"estimator counted {own_releases} releases, but {own_jobs} jobs + {own_skipped} skipped"))
+                out.append(
+                    Finding(
+                        "conservation",
+                        "fail",
+                        f"estimator counted {own_releases} releases, but {own_jobs} jobs + {own_skipped} skipped",
+                    )
+                )
             elif jobs < own_jobs:
-                out.append(Finding("conservation", "inconclusive",
-                                   f"estimator executed {own_jobs} jobs, only {jobs} of them are in the log"))
+                out.append(
+                    Finding(
+                        "conservation",
+                        "inconclusive",
+                        f"estimator executed {own_jobs} jobs, only {jobs} of them are in the log",
+                    )
+                )
             else:
-                out.append(Finding("conservation", "pass",
-                                   f"{own_releases} releases = {own_jobs} jobs + {own_skipped} skipped"))
+                out.append(
+                    Finding(
+                        "conservation", "pass", f"{own_releases} releases = {own_jobs} jobs + {own_skipped} skipped"
+                    )
+                )
         return out
 
     def _judge_log(self, dropped: int) -> Finding:
         if dropped or self._damaged:
-            return Finding("log", "inconclusive", f"{dropped} frames missing, {self._damaged} damaged: figures may be wrong")
+            return Finding(
+                "log", "inconclusive", f"{dropped} frames missing, {self._damaged} damaged: figures may be wrong"
+            )
         return Finding("log", "pass", f"{self._frames} frames, none missing by their counters")
 
 

@@ -84,8 +84,21 @@ class Supervisor:
         config = self._plan.log.with_suffix(".config.json")
         config.write_text(json.dumps(self._log_config()))
         try:
-            logger = self._start("logger", [sys.executable, "-m", "rt_runner.logger", "--bus", bus,
-                                            "--log", str(self._plan.log), "--config", str(config)], self._others)
+            logger = self._start(
+                "logger",
+                [
+                    sys.executable,
+                    "-m",
+                    "rt_runner.logger",
+                    "--bus",
+                    bus,
+                    "--log",
+                    str(self._plan.log),
+                    "--config",
+                    str(config),
+                ],
+                self._others,
+            )
             logger.wait_line("ready", 30.0, lambda: self._stopped)
         finally:
             config.unlink(missing_ok=True)
@@ -97,15 +110,44 @@ class Supervisor:
 
     def _run_on(self, bus: str, logger: Child) -> dict:
         plan, scenario = self._plan, self._plan.scenario
-        facts = RunFacts(bus=plan.bus.name, scenario=scenario.name, period_s=scenario.estimator.period_s,
-                         seed=plan.seed, limits=scenario.limits)
+        facts = RunFacts(
+            bus=plan.bus.name,
+            scenario=scenario.name,
+            period_s=scenario.estimator.period_s,
+            seed=plan.seed,
+            limits=scenario.limits,
+        )
         crash, began, steal_0 = None, time.monotonic(), machine.steal_ms(self._core)
         try:
-            plant = self._start("plant", [sys.executable, "-m", "plant_sim", "--scenario", str(scenario.path),
-                                          "--bus", bus, "--seed", str(plan.seed), "--duration", str(scenario.duration_s)]
-                                if scenario.duration_s else
-                                [sys.executable, "-m", "plant_sim", "--scenario", str(scenario.path),
-                                 "--bus", bus, "--seed", str(plan.seed)], self._others)
+            plant = self._start(
+                "plant",
+                [
+                    sys.executable,
+                    "-m",
+                    "plant_sim",
+                    "--scenario",
+                    str(scenario.path),
+                    "--bus",
+                    bus,
+                    "--seed",
+                    str(plan.seed),
+                    "--duration",
+                    str(scenario.duration_s),
+                ]
+                if scenario.duration_s
+                else [
+                    sys.executable,
+                    "-m",
+                    "plant_sim",
+                    "--scenario",
+                    str(scenario.path),
+                    "--bus",
+                    bus,
+                    "--seed",
+                    str(plan.seed),
+                ],
+                self._others,
+            )
             plant.wait_line("ready", READY_S, lambda: self._stopped)
             estimator = self._start("estimator", self._estimator_command(bus), None)
             granted = estimator.wait_line("ready", 10.0, lambda: self._stopped)
@@ -126,15 +168,28 @@ class Supervisor:
             for child in reversed(self._children[1:]):
                 child.stop()
         steal_1 = machine.steal_ms(self._core)
-        facts = replace(facts, duration_s=time.monotonic() - began, crash=crash,
-                        stopped_by="crash" if crash else "interrupt" if self._stopped else "end",
-                        steal_ms=None if steal_0 is None or steal_1 is None else steal_1 - steal_0)
+        facts = replace(
+            facts,
+            duration_s=time.monotonic() - began,
+            crash=crash,
+            stopped_by="crash" if crash else "interrupt" if self._stopped else "end",
+            steal_ms=None if steal_0 is None or steal_1 is None else steal_1 - steal_0,
+        )
         return self._finish(logger, facts)
 
     def _estimator_command(self, bus: str) -> list[str]:
         e = self._plan.scenario.estimator
-        command = [str(paths.binary("rt_estimator")), "--bus", bus, "--setting", e.setting,
-                   "--period-us", str(round(e.period_s * 1e6)), "--core", str(self._core)]
+        command = [
+            str(paths.binary("rt_estimator")),
+            "--bus",
+            bus,
+            "--setting",
+            e.setting,
+            "--period-us",
+            str(round(e.period_s * 1e6)),
+            "--core",
+            str(self._core),
+        ]
         return command if self._plan.realtime else [*command, "--no-rt"]
 
     def _watch(self, plant: Child, estimator: Child, logger: Child) -> None:
@@ -203,7 +258,14 @@ def check_same_dbc(granted: dict, dbc: Dbc) -> None:
 
 def log_config(scenario: Scenario, bus: str, seed: int) -> dict:
     """What a log carries beside its frames: metadata ``run`` and the attachments that make the run repeatable."""
-    run = {"scenario": scenario.name, "title": scenario.title, "bus": bus, "seed": str(seed),
-           "setting": scenario.estimator.setting, "period_s": repr(scenario.estimator.period_s),
-           "scenario_sha256": scenario.sha256, **machine.describe()}
+    run = {
+        "scenario": scenario.name,
+        "title": scenario.title,
+        "bus": bus,
+        "seed": str(seed),
+        "setting": scenario.estimator.setting,
+        "period_s": repr(scenario.estimator.period_s),
+        "scenario_sha256": scenario.sha256,
+        **machine.describe(),
+    }
     return {"run": run, "attachments": {"scenario.toml": str(scenario.path)}}

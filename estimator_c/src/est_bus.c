@@ -158,7 +158,7 @@ void est_bus_timing_a(est_bus *self, const est_timing *in, struct canfd_frame *f
     raw.warmup = in->warmup ? 1U : 0U;
     raw.stale_input = in->stale_input ? 1U : 0U;
     raw.after_skip = in->after_skip ? 1U : 0U;
-    raw.release_index = drive_est_timing_a_release_index_to_raw((double)in->release_index);
+    raw.release_index = (uint32_t)((uint64_t)in->release_index & 0xFFFFFFU); /* wraps: 4.7 h at 1 ms */
     raw.wake_lat_us = drive_est_timing_a_wake_lat_us_to_raw(us_of(in->wake_lat_ns));
     SEAL(self, DRIVE_INDEX_EST_TIMING_A, est_timing_a, raw, frame);
 }

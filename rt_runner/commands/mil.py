@@ -5,8 +5,11 @@ def add_parser(verbs) -> None:
     """Add the verb."""
     from rt_runner.commands.run import add_scenario_options
 
-    p = verbs.add_parser("mil", help="the same plant and estimator in lock-step, without a clock",
-                         description="Run plant and estimator in lock-step, as fast as they go, with the same log and result.")
+    p = verbs.add_parser(
+        "mil",
+        help="the same plant and estimator in lock-step, without a clock",
+        description="Run plant and estimator in lock-step, as fast as they go, with the same log and result.",
+    )
     add_scenario_options(p)
     p.set_defaults(run=run, scenario="lap")
 

@@ -5,10 +5,15 @@ import argparse
 
 def add_parser(verbs) -> None:
     """Add the verb."""
-    p = verbs.add_parser("run", help="plant and estimator over CAN, in real time",
-                         description="Run plant, estimator and logger on a CAN bus in real time, then judge the log.")
+    p = verbs.add_parser(
+        "run",
+        help="plant and estimator over CAN, in real time",
+        description="Run plant, estimator and logger on a CAN bus in real time, then judge the log.",
+    )
     add_scenario_options(p)
-    p.add_argument("--bus", default="auto", metavar="auto|vcan0|can0|hub", help="default: vcan0 if it exists, else the hub")
+    p.add_argument(
+        "--bus", default="auto", metavar="auto|vcan0|can0|hub", help="default: vcan0 if it exists, else the hub"
+    )
     p.add_argument("--core", type=int, help="core of the estimator (default: the last one)")
     p.add_argument("--no-rt", action="store_true", help="do not ask for SCHED_FIFO and locked memory")
     p.set_defaults(run=run)
@@ -16,11 +21,15 @@ def add_parser(verbs) -> None:
 
 def add_scenario_options(p: argparse.ArgumentParser) -> None:
     """Options that ``run`` and ``mil`` share."""
-    p.add_argument("scenario", nargs="?", default="hot-lap", metavar="SCENARIO", help="name or .toml file (default: hot-lap)")
+    p.add_argument(
+        "scenario", nargs="?", default="hot-lap", metavar="SCENARIO", help="name or .toml file (default: hot-lap)"
+    )
     p.add_argument("--duration", type=float, metavar="S", help="seconds, instead of the scenario's")
     p.add_argument("--setting", help="estimator setting: default or paper")
     p.add_argument("--period", type=float, metavar="S", help="period of the estimator's loop, 0.001 … 1")
-    p.add_argument("--log", metavar="FILE.mcap", help="default: logs/SCENARIO-TIME.mcap; an existing file is kept, renamed")
+    p.add_argument(
+        "--log", metavar="FILE.mcap", help="default: logs/SCENARIO-TIME.mcap; an existing file is kept, renamed"
+    )
     p.add_argument("--json", metavar="FILE", help="write the result as JSON (- for standard output)")
     p.add_argument("--seed", type=int, default=1, help="of sensor noise and generated cycles (default: 1)")
 

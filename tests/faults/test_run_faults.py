@@ -37,10 +37,13 @@ class LiveRun:
 
     def hub_path(self, timeout_s: float = 60) -> str:
         """The socket a stranger would attach to, as the run prints it."""
-        return self._wait(lambda: next((x.split("-c ")[1].split()[0] for x in self.lines if "-i rt_hub -c " in x), None), timeout_s)
+        return self._wait(
+            lambda: next((x.split("-c ")[1].split()[0] for x in self.lines if "-i rt_hub -c " in x), None), timeout_s
+        )
 
     def pid(self, needle: str, timeout_s: float = 60) -> int:
         """Process of this run whose command line contains ``needle``."""
+
         def find():
             for p in Path("/proc").glob("[0-9]*"):
                 try:
@@ -50,6 +53,7 @@ class LiveRun:
                 except OSError:
                     continue
             return None
+
         return self._wait(find, timeout_s)
 
     def wait_for_estimates(self) -> None:
@@ -97,6 +101,7 @@ def live(tmp_path):
 
 
 # ---- refused before anything starts -----------------------------------------------------------------------
+
 
 @pytest.mark.parametrize(
     ("args", "says"),
@@ -174,6 +179,7 @@ def test_a_dbc_that_does_not_parse(tmp_path):
 
 
 # ---- while it runs ----------------------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize(("needle", "name"), [("plant_sim", "plant"), ("rt_estimator", "estimator")])
 def test_a_process_killed_while_running(live, needle, name):
@@ -284,7 +290,9 @@ def test_a_full_disk(live, tmp_path):
 
 
 def test_a_result_that_cannot_be_written(tmp_path):
-    done = rt_runner("mil", "hot-lap", "--duration", 1, "--log", tmp_path / "x.mcap", "--json", tmp_path / "no" / "x.json")
+    done = rt_runner(
+        "mil", "hot-lap", "--duration", 1, "--log", tmp_path / "x.mcap", "--json", tmp_path / "no" / "x.json"
+    )
     assert done.returncode == 1
     assert "cannot write --json" in done.stderr
 

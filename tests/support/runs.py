@@ -14,14 +14,27 @@ RT_RUNNER = [sys.executable, "-m", "rt_runner.cli"]
 
 def rt_runner(*args, timeout_s: float = 300, env: dict | None = None) -> subprocess.CompletedProcess:
     """Run a verb to its end; standard output and error as text."""
-    return subprocess.run([*RT_RUNNER, *map(str, args)], capture_output=True, text=True, timeout=timeout_s, cwd=ROOT,
-                          env={**os.environ, **(env or {})}, check=False)
+    return subprocess.run(
+        [*RT_RUNNER, *map(str, args)],
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        cwd=ROOT,
+        env={**os.environ, **(env or {})},
+        check=False,
+    )
 
 
 def start_rt_runner(*args, env: dict | None = None) -> subprocess.Popen:
     """Start a verb and return at once."""
-    return subprocess.Popen([*RT_RUNNER, *map(str, args)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                            cwd=ROOT, env={**os.environ, **(env or {})})
+    return subprocess.Popen(
+        [*RT_RUNNER, *map(str, args)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, **(env or {})},
+    )
 
 
 def load_result(path: Path) -> dict:

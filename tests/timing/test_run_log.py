@@ -3,6 +3,7 @@
 One real run per transport: plant, estimator and logger as processes, fifteen seconds of the hot lap.
 """
 
+import itertools
 from collections import defaultdict
 from types import SimpleNamespace
 
@@ -44,7 +45,7 @@ def test_every_release_is_accounted_for(run):
     indices = [unwrap(v["release_index"]) for _, v, _ in run.frames["EstTimingA"]]
     assert indices == sorted(set(indices)), "a release ran twice, or out of order"
     released = indices[-1] - indices[0] + 1
-    skipped = sum(b - a - 1 for a, b in zip(indices, indices[1:], strict=False))
+    skipped = sum(b - a - 1 for a, b in itertools.pairwise(indices))
     assert len(indices) + skipped == released
     final_releases, final_misses = run.frames["EstReleases"][-1][1], run.frames["EstMisses"][-1][1]
     assert final_releases["releases"] == final_releases["jobs"] + final_misses["miss_skipped"]
@@ -89,7 +90,7 @@ def test_ids_come_at_their_dbc_rates(run):
 
 def test_job_frames_come_once_per_period(run):
     stamps = [t for t, _, _ in run.frames["Estimate"]]
-    steps = sorted(b - a for a, b in zip(stamps, stamps[1:], strict=False))
+    steps = sorted(b - a for a, b in itertools.pairwise(stamps))
     assert steps[len(steps) // 2] == pytest.approx(100e6, rel=0.02)
     released = run.result["timing"]["estimator"]["releases"]
     assert (stamps[-1] - stamps[0]) / 100e6 == pytest.approx(released - 1, abs=1)
@@ -98,7 +99,7 @@ def test_job_frames_come_once_per_period(run):
 def test_counters_have_no_gaps(run):
     for name, frames in run.frames.items():
         counters = [int(v["counter"]) for _, v, _ in frames]
-        steps = {(b - a) % 16 for a, b in zip(counters, counters[1:], strict=False)}
+        steps = {(b - a) % 16 for a, b in itertools.pairwise(counters)}
         assert steps <= {1}, f"{name}: counter steps {steps}"
         assert {e for _, _, e in frames} == {0}, name
 

@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -30,7 +31,7 @@ def test_a_child_that_dies_leaves_its_last_words():
 
 
 def test_a_child_that_is_killed_says_by_what():
-    child = python('print(\'{"ready": true}\'); import time; time.sleep(60)')
+    child = python("print('{\"ready\": true}'); import time; time.sleep(60)")
     child.wait_line("ready", 10)
     os.kill(child.process.pid, signal.SIGKILL)
     with pytest.raises(ChildError, match="SIGKILL"):
@@ -45,7 +46,7 @@ def test_silence_has_a_limit():
 
 
 def test_a_deaf_child_is_killed():
-    child = python('import signal, time; signal.signal(15, signal.SIG_IGN); print(\'{"ready": 1}\'); time.sleep(60)')
+    child = python("import signal, time; signal.signal(15, signal.SIG_IGN); print('{\"ready\": 1}'); time.sleep(60)")
     child.wait_line("ready", 10)
     assert child.stop(grace_s=0.2) == -signal.SIGKILL
 
@@ -62,7 +63,7 @@ def test_children_die_with_their_supervisor():
     supervisor.reap(5)
     for _ in range(100):
         try:
-            state = open(f"/proc/{grandchild}/stat").read().rsplit(")", 1)[1].split()[0]
+            state = Path(f"/proc/{grandchild}/stat").read_text().rsplit(")", 1)[1].split()[0]
         except OSError:
             return
         if state in "ZX":

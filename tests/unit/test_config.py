@@ -65,7 +65,7 @@ def test_unknown_scenario_names_the_known_ones():
 
 
 def test_missing_file_is_named():
-    with pytest.raises(UsageError, match="cannot read scenario gone.toml"):
+    with pytest.raises(UsageError, match=r"cannot read scenario gone\.toml"):
         load_scenario("./gone.toml")
 
 

@@ -25,12 +25,28 @@ def feed_run(acc, seconds=30, error=0.1, raw=-1.2, first_tick=40_001, skip=(), l
         put(t, "TruthTemp", {"theta_w_true_degc": true_w, "theta_r_true_degc": true_r, "tick": tick % 65536})
         put(t, "TempMeas", {"theta_w_meas_degc": true_w + raw, "theta_r_meas_degc": true_r + raw, "tick": tick % 65536})
         release += 1 + (k in skip)
-        put(t + 1000, "Estimate", {"status": 2, "theta_w_est_degc": true_w + error,
-                                   "theta_r_est_degc": true_r - error, "tick": tick % 65536})
-        put(t + 2000, "EstTimingA", {"miss_late": int(k in late), "warmup": int(k < warmup), "stale_input": 0,
-                                     "after_skip": 0, "release_index": release % 2**24, "wake_lat_us": 20.0 + k % 7})
-        put(t + 3000, "EstTimingB", {"miss_cause": cause if k in late or k + 1 in skip else 0,
-                                     "exec_wall_us": 40.0, "resp_us": 70.0})
+        put(
+            t + 1000,
+            "Estimate",
+            {"status": 2, "theta_w_est_degc": true_w + error, "theta_r_est_degc": true_r - error, "tick": tick % 65536},
+        )
+        put(
+            t + 2000,
+            "EstTimingA",
+            {
+                "miss_late": int(k in late),
+                "warmup": int(k < warmup),
+                "stale_input": 0,
+                "after_skip": 0,
+                "release_index": release % 2**24,
+                "wake_lat_us": 20.0 + k % 7,
+            },
+        )
+        put(
+            t + 3000,
+            "EstTimingB",
+            {"miss_cause": cause if k in late or k + 1 in skip else 0, "exec_wall_us": 40.0, "resp_us": 70.0},
+        )
     return release
 
 
