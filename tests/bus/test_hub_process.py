@@ -99,6 +99,27 @@ def test_clients_survive_garbage_from_a_broken_hub(fake_hub):
             reader.recv(1)
 
 
+def test_frames_of_a_hub_that_died_are_still_read(fake_hub):
+    """It dies with a frame of ours unread, which resets the connection before what it had queued for us."""
+    listener, bus = fake_hub
+    with open_bus(bus) as reader:
+        server = listener.accept()[0]
+        reader.send(message(1))
+        server.send(frame(0x31))
+        server.send(frame(0x32))
+        server.close()
+        assert [reader.recv(5).arbitration_id for _ in range(2)] == [0x31, 0x32]
+        for _ in range(2):
+            with pytest.raises(can.CanOperationError, match="has closed the connection"):
+                reader.recv(5)
+
+
+def test_the_c_port_call_by_call(tmp_path):
+    done = subprocess.run([build("tests/c/test_hub_client.c"), tmp_path / "bus"], capture_output=True, text=True,
+                          timeout=120)  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (0, "ok\n", "")
+
+
 def test_the_c_port_survives_garbage_and_does_not_loop_on_it(fake_hub):
     listener, bus = fake_hub
     client = Client(bus, "recv", 1)

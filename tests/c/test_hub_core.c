@@ -46,13 +46,13 @@ static void run(int64_t now_ns)
     }
     if (hub.blocked) {
       hub_hand_out(&hub, now_ns, on_stall, &hub);
-      if (hub.blocked) {
-        CHECK(hub_poll_timeout_ms(&hub) == HUB_RETRY_MS);
-        return;
-      }
     }
     while (hub_take(&hub, fds, count)) {
       hub_hand_out(&hub, now_ns, on_stall, &hub);
+    }
+    if (hub.blocked) {
+      CHECK(hub_poll_timeout_ms(&hub) == HUB_RETRY_MS);
+      return;
     }
   }
 }
@@ -132,6 +132,32 @@ static void a_full_reader_holds_everybody_back_and_nothing_is_lost(void)
   CHECK(hub.counters.blocked_ns > 0 && hub_poll_timeout_ms(&hub) == -1);
   hub_close(&hub);
   CHECK(close(a) == 0 && close(slow) == 0 && close(fast) == 0);
+}
+
+static void nobody_is_read_while_the_bus_waits_not_even_a_dead_client(void)
+{
+  hub_init(&hub, SECOND);
+  const int a = join(1), slow = join(2), dying = join(3);
+  uint32_t sent = 0, got = 0;
+  int64_t id;
+  for (; !hub.blocked; sent++) {
+    CHECK(put(a, sent & 0x7ff));
+    run(0);
+  }
+  CHECK(put(dying, 0x123) && close(dying) == 0); /* full, with a word left to say, and poll reports it */
+  run(0);
+  CHECK(hub.blocked);
+  do {
+    run(0);
+    while ((id = get(slow)) >= 0 && got < sent) {
+      CHECK(id == (got & 0x7ff));
+      got++;
+      run(0);
+    }
+  } while (id != 0x123);
+  CHECK(got == sent && get(slow) == -1 && get(a) == 0x123);
+  hub_close(&hub);
+  CHECK(close(a) == 0 && close(slow) == 0);
 }
 
 static void who_does_not_read_is_disconnected_by_name(void)
@@ -258,6 +284,7 @@ int main(void)
 {
   everybody_but_the_sender_gets_a_frame_in_one_order();
   a_full_reader_holds_everybody_back_and_nothing_is_lost();
+  nobody_is_read_while_the_bus_waits_not_even_a_dead_client();
   who_does_not_read_is_disconnected_by_name();
   garbage_is_counted_and_harms_nobody();
   the_last_frames_of_a_dying_client_arrive();
