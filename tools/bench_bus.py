@@ -17,7 +17,8 @@ CLIENT = "tests/test_hub_port"
 
 def start(bus: str, *arguments: object) -> subprocess.Popen:
     """A C client that is connected."""
-    p = subprocess.Popen([paths.binary(CLIENT), bus, *map(str, arguments)], stdout=subprocess.PIPE, text=True)
+    # Unbuffered: communicate() reads the descriptor and would miss what readline has read ahead.
+    p = subprocess.Popen([paths.binary(CLIENT), bus, *map(str, arguments)], stdout=subprocess.PIPE, bufsize=0)
     assert p.stdout is not None
     p.stdout.readline()
     return p
@@ -26,7 +27,7 @@ def start(bus: str, *arguments: object) -> subprocess.Popen:
 def last_line(p: subprocess.Popen) -> list[dict]:
     """What a client has printed by its end."""
     out, _ = p.communicate()
-    return [json.loads(line) for line in out.splitlines() if line.startswith("{")]
+    return [json.loads(line) for line in out.splitlines() if line.startswith(b"{")]
 
 
 def flood(bus: str, count: int) -> dict:

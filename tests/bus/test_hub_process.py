@@ -179,7 +179,7 @@ def test_a_client_that_has_connected_misses_nothing_sent_afterwards(hub):
 def test_killed_hub_is_one_line_for_python_and_for_c(hub):
     reader, client = hub.open(), hub.client("recv", 5)
     reader.send(message(0x10))
-    wait_until(lambda: "00000010" in client.process.stdout.readline())
+    wait_until(lambda: "00000010" in client.read_line())
     hub.hub.process.kill()
     hub.hub.process.wait()
     with pytest.raises(can.CanOperationError, match=rf"rt_hub {hub.hub.path}: the hub has closed the connection"):

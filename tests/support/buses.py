@@ -39,12 +39,16 @@ class Program:
     """A C program under test. A sanitizer's report, which goes to stderr, fails the test that ends it."""
 
     def __init__(self, source: str, *arguments: object) -> None:
-        self.process = subprocess.Popen([build(source), *map(str, arguments)], text=True,
+        # Unbuffered: communicate() reads the descriptor and would miss what readline has read ahead.
+        self.process = subprocess.Popen([build(source), *map(str, arguments)], bufsize=0,
                                         stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
         self.ready: dict = {}
-        line = self.process.stdout.readline()  # type: ignore[union-attr]
-        if line:
+        if line := self.read_line():
             self.ready = json.loads(line)
+
+    def read_line(self) -> str:
+        """The next line of stdout, empty at its end."""
+        return self.process.stdout.readline().decode()  # type: ignore[union-attr]
 
     def end(self, sig: int | None = None, timeout_s: float = 60.0) -> tuple[int, list[str], str]:
         """Wait for the end (after a signal); exit status, lines of stdout, stderr."""
@@ -55,7 +59,8 @@ class Program:
         except subprocess.TimeoutExpired:
             self.process.kill()
             out, err = self.process.communicate()
-            raise AssertionError(f"did not end within {timeout_s:g} s: {out} {err}") from None
+            raise AssertionError(f"did not end within {timeout_s:g} s: {out!r} {err!r}") from None
+        out, err = out.decode(), err.decode()
         assert "Sanitizer" not in err, err
         assert "runtime error" not in err, err
         return self.process.returncode, out.splitlines(), err
