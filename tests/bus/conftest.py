@@ -2,7 +2,13 @@
 
 import pytest
 
-from tests.support.buses import TRANSPORTS, Buses, Hub, have_vcan
+from tests.support.buses import TRANSPORTS, Buses, Hub, end_leftovers, have_vcan
+
+
+@pytest.fixture(autouse=True)
+def _no_leftovers():
+    yield
+    end_leftovers()
 
 
 @pytest.fixture

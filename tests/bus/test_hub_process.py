@@ -266,14 +266,18 @@ def test_a_starting_hub_waits_for_another_that_is_starting(tmp_path):
     """Both look whether the socket is stale under a lock of its folder."""
     folder = os.open(tmp_path, os.O_RDONLY)
     fcntl.flock(folder, fcntl.LOCK_EX)
-    with subprocess.Popen([build("estimator_c/apps/rt_hub.c"), "--socket", tmp_path / "bus"], text=True,
-                          stdout=subprocess.PIPE) as p:  # fmt: skip
+    p = subprocess.Popen([build("estimator_c/apps/rt_hub.c"), "--socket", tmp_path / "bus"], text=True,
+                         stdout=subprocess.PIPE)  # fmt: skip
+    try:
         assert select.select([p.stdout], [], [], 0.5)[0] == []
         fcntl.flock(folder, fcntl.LOCK_UN)
         assert '"ready":true' in p.stdout.readline()
         p.terminate()
         assert p.wait(20) == 0
-    os.close(folder)
+    finally:
+        p.kill()
+        p.communicate()
+        os.close(folder)
 
 
 def test_a_full_table_refuses_politely(hub):

@@ -35,6 +35,18 @@ def build(source: str) -> Path:
 _FOLDERS: list[tempfile.TemporaryDirectory] = []
 
 
+_PROGRAMS: list[subprocess.Popen] = []
+
+
+def end_leftovers() -> None:
+    """Kill what a failed test has left running."""
+    while _PROGRAMS:
+        p = _PROGRAMS.pop()
+        if p.poll() is None:
+            p.kill()
+            p.communicate()
+
+
 class Program:
     """A C program under test. A sanitizer's report, which goes to stderr, fails the test that ends it."""
 
@@ -42,6 +54,7 @@ class Program:
         # Unbuffered: communicate() reads the descriptor and would miss what readline has read ahead.
         self.process = subprocess.Popen([build(source), *map(str, arguments)], bufsize=0,
                                         stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
+        _PROGRAMS.append(self.process)
         self.ready: dict = {}
         if line := self.read_line():
             self.ready = json.loads(line)
