@@ -104,8 +104,10 @@ def _remark(m: MessageSummary) -> str:
     remarks = ["simulation only"] if m.simulation_only else []
     if m.rate_ok is False and m.mean_ms:
         remarks.append("too fast" if m.mean_ms < m.cycle_ms else "too slow")
+    if m.timed_out:
+        remarks.append(f"silent beyond its timeout of {m.timeout_ms:g}")
     return ", ".join(remarks)
 
 
 def _is_clean(m: MessageSummary) -> bool:
-    return m.rate_ok is not False and not (m.lost or m.repeated or m.wrong_sequence or m.wrong_crc)
+    return m.rate_ok is not False and not (m.timed_out or m.lost or m.repeated or m.wrong_sequence or m.wrong_crc)

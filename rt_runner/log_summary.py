@@ -23,6 +23,7 @@ class MessageSummary:
     cycle_ms: float  # of the DBC; for frames sent per job the period of the loop, where the log says it
     per_job: bool
     simulation_only: bool
+    timeout_ms: float = 0.0  # of the DBC, or three periods of the loop where that is longer; 0 where unknown
     frames: int = 0
     mean_ms: float | None = None
     min_ms: float | None = None
@@ -32,6 +33,11 @@ class MessageSummary:
     repeated: int = 0
     wrong_sequence: int = 0
     wrong_crc: int = 0
+
+    @property
+    def timed_out(self) -> bool:
+        """Whether it was silent at least once for longer than a receiver waits."""
+        return self.max_ms is not None and 0.0 < self.timeout_ms < self.max_ms
 
     @property
     def rate_ok(self) -> bool | None:
@@ -155,6 +161,7 @@ def _messages(reader: LogReader) -> dict[str, MessageSummary]:
             cycle_ms=cycle_ms,
             per_job=per_job,
             simulation_only=about.get("simulation_only") == "1",
+            timeout_ms=max(_float(about.get("timeout_ms")) or 0.0, 3 * cycle_ms if per_job else 0.0),
         )
     return out
 

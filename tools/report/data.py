@@ -80,6 +80,7 @@ class FrameStat:
     rate_ok: bool | None
     gap_min_ms: float | None
     gap_max_ms: float | None
+    timed_out: bool
     counter_gaps: int
     repeats: int
     crc_errors: int

@@ -169,6 +169,7 @@ def _frame_stat(m: MessageSummary) -> FrameStat:
         rate_ok=m.rate_ok,
         gap_min_ms=m.min_ms,
         gap_max_ms=m.max_ms,
+        timed_out=m.timed_out,
         counter_gaps=m.counter_gaps,
         repeats=m.repeated,
         crc_errors=m.wrong_crc,

@@ -153,7 +153,8 @@ def frames_table(frames: tuple[FrameStat, ...]) -> str:
             f'<tr><td class="mono id">0x{f.can_id:03X}</td><td>{esc(f.name)}</td><td>{esc(f.sender)}</td>'
             f'<td class="n">{number(f.cycle_ms)}</td><td class="n">{number(f.count)}</td>'
             f'<td class="n{" hot" if f.rate_ok is False else ""}">{number(f.rate_hz, 2)}</td>'
-            f'<td class="n">{number(f.gap_min_ms, 2)}</td><td class="n">{number(f.gap_max_ms, 2)}</td>'
+            f'<td class="n">{number(f.gap_min_ms, 2)}</td>'
+            f'<td class="n{" hot" if f.timed_out else ""}">{number(f.gap_max_ms, 2)}</td>'
             f"{_count(f.counter_gaps)}{_count(f.repeats)}{_count(f.crc_errors)}</tr>"
         )
     return f"""<section class="panel frames"><h2>Frames on the bus</h2><div class="scroll"><table>
@@ -164,7 +165,7 @@ def frames_table(frames: tuple[FrameStat, ...]) -> str:
 <th class="n">counter gaps</th><th class="n">E2E repeats</th><th class="n">E2E CRC</th></tr></thead>
 <tbody>{"".join(rows)}</tbody></table></div>
 <p class="note">gaps between receptions by the logger; the cycle of frames sent once per job is the loop's period;
-red: rate more than 5 % off the cycle, or an end-to-end (E2E) fault</p></section>"""
+red: rate more than 5 % off the cycle, silence beyond the DBC timeout, or an end-to-end (E2E) fault</p></section>"""
 
 
 def _count(value: int) -> str:
