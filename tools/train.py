@@ -87,7 +87,6 @@ def fit(
     windows = Windows(rows, parts.train, scaling, s)
     validation = Validation.of(windows, parts.held, s)
     weights = row_weights(windows.length, s)
-    rate_scale = torch.tensor(scaling.out_scale, dtype=torch.float32)
     adam = torch.optim.Adam(net.parameters(), lr=s.lr, weight_decay=s.l2)
 
     best: Progress | None = None
@@ -116,7 +115,7 @@ def fit(
             total = 0.0
             for _ in range(windows.batches_per_epoch()):
                 u, y = windows.draw()
-                loss = loss_of(net(u) - y, weights, rate_scale, s)
+                loss = loss_of(net(u) - y, weights, s.rotor_weight)
                 adam.zero_grad()
                 loss.backward()
                 torch.nn.utils.clip_grad_norm_(net.parameters(), s.clip)
