@@ -255,7 +255,7 @@ can_port_status_t can_port_recv(can_port_t *port, struct canfd_frame *frame, int
     port->counters.received++;
     return CAN_PORT_OK;
   }
-  return CAN_PORT_EMPTY;
+  return CAN_PORT_SKIPPED;
 }
 
 can_port_status_t can_port_send(can_port_t *port, const struct canfd_frame *frame)

@@ -33,7 +33,8 @@ typedef enum {
   CAN_PORT_EMPTY,  /* recv: nothing (more) to read now */
   CAN_PORT_FULL,   /* send: no room now, the frame was NOT sent; counted in tx_drops */
   CAN_PORT_GONE,   /* the bus has ended: hub closed, interface down or removed. Only close helps */
-  CAN_PORT_REFUSED /* the argument is unusable (frame that no CAN bus carries, bus string, filters) */
+  CAN_PORT_REFUSED, /* the argument is unusable (frame that no CAN bus carries, bus string, filters) */
+  CAN_PORT_SKIPPED /* recv: CAN_PORT_SKIP_MAX unusable datagrams skipped, more may wait: call again when there is time */
 } can_port_status_t;
 
 /* Counters only grow. */
@@ -77,9 +78,10 @@ can_port_status_t can_port_send_only(can_port_t *port);
 
 /* Read the oldest frame.
  * `rx_ns`: the kernel's receive stamp, CLOCK_REALTIME in ns since 1970 (UTC); may be NULL.
- * Cost: one system call (about 1 us) plus one for each datagram skipped, at most CAN_PORT_SKIP_MAX of them, then EMPTY
+ * Cost: one system call (about 1 us) plus one for each datagram skipped, at most CAN_PORT_SKIP_MAX of them, then SKIPPED
  * with the rest still queued: the call is bounded whatever arrives. Never blocks.
- * Failure: EMPTY, GONE (every later call too; frames that were queued before the end are delivered first). */
+ * Failure: EMPTY (nothing is queued), SKIPPED (call again), GONE (every later call too; frames that were queued before
+ * the end are delivered first). */
 can_port_status_t can_port_recv(can_port_t *port, struct canfd_frame *frame, int64_t *rx_ns);
 
 /* Send a frame: classic if flags has no CANFD_FDF. Cost: one system call. Never blocks, never retries.

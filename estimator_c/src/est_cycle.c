@@ -63,6 +63,10 @@ static est_cycle_status read_inputs(est_cycle *self) {
     int64_t at_ns = 0;
     for (int i = 0; i < EST_CYCLE_MAX_FRAMES; i++) {
         const est_io_status status = self->io.recv(self->io.ctx, &frame, &at_ns);
+        if (status == EST_IO_SKIPPED) {
+            i += EST_IO_SKIP_COST - 1; /* a storm of error frames: read on, within the same budget */
+            continue;
+        }
         if (status != EST_IO_OK) {
             return status == EST_IO_GONE ? EST_CYCLE_GONE : EST_CYCLE_OK;
         }

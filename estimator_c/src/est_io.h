@@ -11,8 +11,11 @@ typedef enum {
     EST_IO_OK = 0,
     EST_IO_EMPTY = 1, /* recv: nothing more now */
     EST_IO_FULL = 2,  /* send: no room; the frame is lost and counted in tx_drops */
-    EST_IO_GONE = 3   /* the bus has ended */
+    EST_IO_GONE = 3,  /* the bus has ended */
+    EST_IO_SKIPPED = 4 /* recv: EST_IO_SKIP_COST datagrams were no frames, more may wait */
 } est_io_status;
+
+enum { EST_IO_SKIP_COST = 64 }; /* what an EST_IO_SKIPPED costs, in frames */
 
 typedef struct {
     uint64_t received;

@@ -8,6 +8,8 @@
 
 enum { SEND_BUFFER_BYTES = 4 << 20 };
 
+_Static_assert((int)CAN_PORT_SKIP_MAX == (int)EST_IO_SKIP_COST, "a skip costs what the cycle takes it to cost");
+
 static void begin(void *ctx, int64_t now_ns) {
     est_port *self = ctx;
     self->drained_ns = self->now_ns;
@@ -24,6 +26,8 @@ static est_io_status status_of(can_port_status_t status) {
     case CAN_PORT_FULL:
     case CAN_PORT_REFUSED: /* no frame of ours is, but a lost frame is what it would be */
         return EST_IO_FULL;
+    case CAN_PORT_SKIPPED:
+        return EST_IO_SKIPPED;
     case CAN_PORT_GONE:
         break;
     }

@@ -49,6 +49,9 @@ static int wait_frame(can_port_t *port, struct canfd_frame *frame, int64_t *stam
     if (status == CAN_PORT_OK) {
       return 0;
     }
+    if (status == CAN_PORT_SKIPPED) {
+      continue;
+    }
     if (status != CAN_PORT_EMPTY) {
       return 3;
     }
