@@ -154,7 +154,7 @@ void est_cycle_counters(const est_cycle *self, est_counters *out) {
         .stale_inputs = self->stale_jobs,
         .rx_drops = io.rx_drops,
         .tx_drops = io.tx_drops,
-        .rejected = io.rejected + faults.rejected,
+        .rejected = io.rejected + io.error_frames + faults.rejected,
     };
     *out = counters;
 }

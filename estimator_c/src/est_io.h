@@ -23,6 +23,7 @@ typedef struct {
     uint64_t rx_drops;
     uint64_t tx_drops;
     uint64_t rejected;
+    uint64_t error_frames;
 } est_io_counters;
 
 typedef struct {

@@ -68,8 +68,12 @@ void est_lockstep_push(est_lockstep *self, const rt_record *record) {
     struct canfd_frame frame;
     memset(&frame, 0, sizeof frame);
     memcpy(&frame, &record->frame, sizeof record->frame);
-    if ((record->frame.can_id & CAN_ERR_FLAG) != 0 || !can_port_valid(&frame, sizeof record->frame)) {
+    if (!can_port_valid(&frame, sizeof record->frame)) {
         self->counters.rejected++;
+        return;
+    }
+    if ((record->frame.can_id & CAN_ERR_FLAG) != 0) {
+        self->counters.error_frames++;
         return;
     }
     if (self->used == EST_LOCKSTEP_QUEUE) {

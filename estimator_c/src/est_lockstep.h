@@ -44,7 +44,7 @@ est_io est_lockstep_io(est_lockstep *self);
 /* Takes note of the next record's time: it may not go back, and not leap. */
 est_lockstep_status est_lockstep_advance(est_lockstep *self, int64_t t_ns);
 
-/* Queues a received frame; one that no CAN bus carries is counted as rejected. */
+/* Queues a received frame; one that no CAN bus carries is counted as rejected, an error frame as such. */
 void est_lockstep_push(est_lockstep *self, const rt_record *record);
 
 #endif

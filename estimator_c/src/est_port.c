@@ -55,6 +55,7 @@ static void counters(void *ctx, est_io_counters *out) {
     out->rx_drops = from->rx_drops;
     out->tx_drops = from->tx_drops;
     out->rejected = from->rejected;
+    out->error_frames = from->error_frames;
 }
 
 est_io est_port_io(est_port *self, can_port_t *port) {

@@ -165,10 +165,11 @@ void est_report_final(FILE *out, const est_cycle *cycle, const est_report_run *r
                   cycle->estimates_lost);
     (void)fprintf(out,
                   ",\"crc_errors\":%" PRIu64 ",\"seq_errors\":%" PRIu64 ",\"stale_inputs\":%" PRIu64 ",\"rx_drops\":%" PRIu64
-                  ",\"tx_drops\":%" PRIu64 ",\"rejected\":%" PRIu64 ",\"foreign\":%" PRIu64 ",\"frames_received\":%" PRIu64
+                  ",\"tx_drops\":%" PRIu64 ",\"rejected\":%" PRIu64 ",\"error_frames\":%" PRIu64 ",\"foreign\":%" PRIu64
+                  ",\"frames_received\":%" PRIu64
                   ",\"frames_sent\":%" PRIu64,
                   counters.crc_errors, counters.seq_errors, counters.stale_inputs, counters.rx_drops, counters.tx_drops,
-                  counters.rejected, cycle->bus.foreign, io.received, io.sent);
+                  counters.rejected, io.error_frames, cycle->bus.foreign, io.received, io.sent);
     put_list(out, "causes", cycle->task.causes, cause_names, sizeof cause_names / sizeof cause_names[0]);
     put_list(out, "status_jobs", cycle->status_jobs, status_names, sizeof status_names / sizeof status_names[0]);
     put_estimator(out, &cycle->estimator.counters);

@@ -32,7 +32,6 @@ static void connect_port(void) {
     const int on = 1;
     CHECK(socketpair(AF_UNIX, SOCK_SEQPACKET | SOCK_NONBLOCK, 0, pair) == 0);
     hub = pair[1];
-
     memset(&port, 0, sizeof port);
     port.fd = pair[0];
     port.hub = true;
@@ -86,6 +85,9 @@ static void a_storm_of_error_frames_hides_nothing(void) {
     put_motor(1);
     CHECK(est_cycle_run_released(&cycle) == EST_CYCLE_OK);
     CHECK(cycle.bus.accepted == 1 && port.counters.error_frames == 3 * CAN_PORT_SKIP_MAX);
+    est_counters counters;
+    est_cycle_counters(&cycle, &counters);
+    CHECK(counters.rejected == 3 * CAN_PORT_SKIP_MAX); /* as published */
 
     io.recv = always_skipped;
     start_cycle();

@@ -158,6 +158,7 @@ def test_what_is_damaged_or_foreign_changes_no_estimate(release, extras):
     assert final["seq_errors"] == count["repeat"]
     assert final["foreign"] == count["foreign"]
     assert final["rejected"] == count["extended"] + count["remote"] + count["error"] + count["long"]
+    assert final["error_frames"] == count["error"]
     faults, bus_faults = run.named("EstInputFaults")[-1].values, run.named("EstBusFaults")[-1].values
     assert (faults["crc_errors"], faults["seq_errors"]) == (final["crc_errors"], final["seq_errors"])
     assert bus_faults["rejected"] == final["rejected"]
