@@ -78,12 +78,16 @@ est_bus_verdict est_bus_accept(est_bus *self, const struct canfd_frame *frame, i
     if (id == EST_RX_MOTOR_STATE ? !out->motor.valid : !(out->temp.valid_w && out->temp.valid_r)) {
         rx->unavailable++;
     }
+    self->accepted++;
+    if (id == EST_RX_MOTOR_STATE && rx->alive && out->tick == rx->last_tick) {
+        return EST_BUS_INPUT; /* the sender lives, what it sends stands still: let it grow stale */
+    }
     if (rx->alive) {
-        rt_stats_add(&rx->gap_ns, at_ns - rx->last_ns, self->accepted);
+        rt_stats_add(&rx->gap_ns, at_ns - rx->last_ns, self->accepted - 1U);
     }
     rx->alive = true;
+    rx->last_tick = out->tick;
     rx->last_ns = at_ns;
-    self->accepted++;
     return EST_BUS_INPUT;
 }
 

@@ -51,9 +51,10 @@ typedef struct {
     bool stale;             /* older than HilTimeoutMs at the last est_bus_stale */
     uint64_t timeouts;      /* times it became stale */
     uint64_t unavailable;   /* usable frames with a value not available */
-    int64_t last_ns;        /* arrival of the last usable frame */
-    rt_stats gap_ns;        /* between usable frames */
-    rt_stats age_ns;        /* of the newest usable frame when a job looked */
+    uint16_t last_tick;     /* of the last usable frame */
+    int64_t last_ns;        /* arrival of the last usable frame that brought news; MotorState: its tick had moved */
+    rt_stats gap_ns;        /* between such frames */
+    rt_stats age_ns;        /* of the newest such frame when a job looked */
 } est_rx;
 
 /* About 75 kB: belongs in static storage. */
@@ -116,7 +117,8 @@ typedef struct {
 /* Empties everything. Cannot fail (the generated tables are valid by their own tests). */
 void est_bus_init(est_bus *self);
 
-/* Judges one frame that arrived at `at_ns`. `out` is written only for EST_BUS_INPUT. Under 1 µs. */
+/* Judges one frame that arrived at `at_ns`. `out` is written only for EST_BUS_INPUT. A MotorState with the tick of the one
+ * before is handed on, but does not keep the input alive: a sender whose model stands still grows stale. Under 1 µs. */
 est_bus_verdict est_bus_accept(est_bus *self, const struct canfd_frame *frame, int64_t at_ns, est_input *out);
 
 /* True if an input that has been alive is older than its timeout at `now_ns`; records the ages under release `index`. Call once per job, after the job's frames. An input never seen yet is not stale: there is nothing to be late. */

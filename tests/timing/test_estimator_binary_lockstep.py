@@ -194,6 +194,27 @@ def test_silent_plant_makes_stale_inputs_and_is_seen_on_the_bus(program):
     assert run.named("Estimate")[-1].values["status"] == OK
 
 
+def test_a_plant_that_sends_but_stands_still_is_stale(program):
+    """Good counters and CRCs, the same tick for two seconds: the frames keep coming, news does not."""
+    plant, records = Plant(), []
+    for tick in range(1001):
+        frozen = 600 if 600 <= tick < 800 else tick
+        records.append(Record(tick * TICK_NS, 0x0A0, plant.motor(frozen)))
+        if tick % 10 == 0:
+            records.append(Record(tick * TICK_NS, 0x1A0, plant.temp(frozen)))
+        records.append(tick_record(tick * TICK_NS))
+    run = run_drive(program, records)
+    assert (run.status, run.final["seq_errors"]) == (0, 0)
+    for estimate, _, timing_a, _ in per_job(run):
+        n = timing_a.values["release_index"]
+        if n > 20:
+            assert timing_a.values["stale_input"] == (61 <= n <= 80), n  # 80 works off the intervals without a frame
+        if 61 <= n <= 79:
+            assert estimate.values["status"] == INPUT_STALE
+    assert run.final["rx"]["MotorState"]["timeouts"] == 1
+    assert run.named("Estimate")[-1].values["status"] == OK
+
+
 def test_a_lost_sensor_is_stale_too_and_the_net_predicts(program):
     records = [r for r in drive(range(1001)) if not (r.can_id == 0x1A0 and 500 <= r.t_ns // TICK_NS < 900)]
     run = run_drive(program, records)
