@@ -16,7 +16,7 @@
 
 enum { STACK_BYTES = 256 * 1024, PAGE_BYTES = 4096 };
 
-__attribute__((format(printf, 2, 3))) static void warn(rt_granted *granted, const char *format, ...) {
+void rt_grant_warn(rt_granted *granted, const char *format, ...) {
     if (granted->warnings >= RT_GRANT_WARNINGS) {
         return;
     }
@@ -84,57 +84,74 @@ static int pinned_core(void) {
     return -1;
 }
 
-static void pin(int core, rt_granted *granted) {
+/* True unless refused, which has its warning. */
+static bool pin(int core, rt_granted *granted) {
     cpu_set_t set;
     CPU_ZERO(&set);
     if (core >= CPU_SETSIZE) {
-        warn(granted, "core %d does not exist; the loop runs on any core", core);
-        return;
+        rt_grant_warn(granted, "core %d does not exist; the loop runs on any core", core);
+        return false;
     }
     CPU_SET((size_t)core, &set);
     if (sched_setaffinity(0, sizeof set, &set) != 0) {
-        warn(granted, "core %d is not available (%s); the loop runs on any core", core, strerror(errno));
+        rt_grant_warn(granted, "core %d is not available (%s); the loop runs on any core", core, strerror(errno));
+        return false;
     }
+    return true;
 }
 
-static void read_back(const rt_request *request, bool locked, rt_granted *granted) {
+/* What the system said yes to. */
+typedef struct {
+    bool core;
+    bool policy;
+    bool lock;
+} answers;
+
+/* Each thing that was granted is looked at by itself: a container may say yes and do nothing. */
+static void read_back(const rt_request *request, const answers *yes, rt_granted *granted) {
     const int policy = sched_getscheduler(0);
     granted->policy = policy == SCHED_FIFO ? RT_POLICY_FIFO : policy == SCHED_RR ? RT_POLICY_RR : RT_POLICY_OTHER;
     struct sched_param param = {0};
     granted->priority = sched_getparam(0, &param) == 0 ? param.sched_priority : 0;
     granted->core = pinned_core();
     granted->locked_kb = proc_number("/proc/self/status", "VmLck:");
-    granted->mlock = locked && granted->locked_kb > 0;
-    if (locked && !granted->mlock) {
-        warn(granted, "mlockall succeeded but VmLck is %lld kB: memory is not locked", (long long)granted->locked_kb);
+    granted->mlock = yes->lock && granted->locked_kb > 0;
+    if (yes->lock && !granted->mlock) {
+        rt_grant_warn(granted, "mlockall succeeded but VmLck is %lld kB: memory is not locked", (long long)granted->locked_kb);
     }
-    if (request->core >= 0 && granted->core != request->core && granted->warnings == 0) {
-        warn(granted, "core %d was asked for, the system reports %d", request->core, granted->core);
+    if (yes->policy && (granted->policy != RT_POLICY_FIFO || granted->priority != request->priority)) {
+        rt_grant_warn(granted, "SCHED_FIFO priority %d was granted, but the system reports policy %s, priority %d",
+                      request->priority, rt_policy_name(granted->policy), granted->priority);
+    }
+    if (yes->core && granted->core != request->core) {
+        rt_grant_warn(granted, "core %d was granted, but the system reports %d (-1: no single one)", request->core,
+                      granted->core);
     }
 }
 
 void rt_grant_apply(const rt_request *request, rt_granted *granted) {
     memset(granted, 0, sizeof *granted);
-    bool locked = false;
+    answers yes = {false, false, false};
     if (request->core >= 0) {
-        pin(request->core, granted);
+        yes.core = pin(request->core, granted);
     }
     if (request->real_time) {
         const struct sched_param param = {.sched_priority = request->priority};
-        if (sched_setscheduler(0, SCHED_FIFO, &param) != 0) {
-            warn(granted, "SCHED_FIFO priority %d refused (%s): needs CAP_SYS_NICE or an rtprio limit; wake-ups will be later",
+        yes.policy = sched_setscheduler(0, SCHED_FIFO, &param) == 0;
+        if (!yes.policy) {
+            rt_grant_warn(granted, "SCHED_FIFO priority %d refused (%s): needs CAP_SYS_NICE or an rtprio limit; wake-ups will be later",
                  request->priority, strerror(errno));
         }
-        locked = mlockall(MCL_CURRENT | MCL_FUTURE) == 0;
-        if (!locked) {
-            warn(granted, "mlockall refused (%s): needs CAP_IPC_LOCK or a larger memlock limit; page faults are possible",
+        yes.lock = mlockall(MCL_CURRENT | MCL_FUTURE) == 0;
+        if (!yes.lock) {
+            rt_grant_warn(granted, "mlockall refused (%s): needs CAP_IPC_LOCK or a larger memlock limit; page faults are possible",
                  strerror(errno));
         }
     }
     (void)prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL); /* 50 µs by default outside SCHED_FIFO */
     prefault_stack();
     rt_grant_flush_denormals();
-    read_back(request, locked, granted);
+    read_back(request, &yes, granted);
 }
 
 /* The second number of schedstat: nanoseconds waited on a run queue. */

@@ -43,6 +43,9 @@ typedef struct {
  * denormal numbers zero (FTZ/DAZ) and reads back what is now in force. Takes milliseconds; call once, before the loop. */
 void rt_grant_apply(const rt_request *request, rt_granted *granted);
 
+/* Adds a warning, shortened to RT_GRANT_WARNING_LENGTH - 1 characters; dropped when there are RT_GRANT_WARNINGS already. */
+__attribute__((format(printf, 2, 3))) void rt_grant_warn(rt_granted *granted, const char *format, ...);
+
 /* Denormals are zero in the calling thread from here on, so that a decaying state never slows the step. O(1). */
 void rt_grant_flush_denormals(void);
 

@@ -4,7 +4,11 @@
 #include <sched.h>
 #include <stdio.h>
 #include <string.h>
+#include <sys/mman.h>
 #include <sys/prctl.h>
+#include <sys/resource.h>
+#include <sys/syscall.h>
+#include <unistd.h>
 
 #include "rt_clock.h"
 #include "rt_grant.h"
@@ -16,6 +20,21 @@
             return 1;                                                            \
         }                                                                        \
     } while (0)
+
+/* A container that says yes to everything and does nothing. */
+static bool all_talk;
+
+int sched_setscheduler(pid_t pid, int policy, const struct sched_param *param) {
+    return all_talk ? 0 : (int)syscall(SYS_sched_setscheduler, pid, policy, param);
+}
+
+int sched_setaffinity(pid_t pid, size_t size, const cpu_set_t *set) {
+    return all_talk ? 0 : (int)syscall(SYS_sched_setaffinity, pid, size, set);
+}
+
+int mlockall(int flags) {
+    return all_talk ? 0 : (int)syscall(SYS_mlockall, flags);
+}
 
 static int denormals(void) {
     volatile double tiny = 2.2250738585072014e-308; /* the smallest normal number */
@@ -56,12 +75,51 @@ static int impossible_core(void) {
     return 0;
 }
 
+static bool warned(const rt_granted *granted, const char *text) {
+    for (int i = 0; i < granted->warnings; i++) {
+        if (strstr(granted->warning[i], text) != NULL) {
+            return true;
+        }
+    }
+    return false;
+}
+
+/* A yes without effect is no grant: one warning for each. */
+static int granted_without_effect(void) {
+    cpu_set_t set;
+    CHECK(sched_getaffinity(0, sizeof set, &set) == 0);
+    int ours = 0;
+    while (!CPU_ISSET((size_t)ours, &set)) {
+        ours++;
+    }
+    CPU_ZERO(&set);
+    CPU_SET((size_t)ours, &set);
+    CHECK(sched_setaffinity(0, sizeof set, &set) == 0);
+    const rt_request request = {ours + 1, 80, true};
+    rt_granted granted;
+    all_talk = true;
+    rt_grant_apply(&request, &granted);
+    all_talk = false;
+    CHECK(warned(&granted, "SCHED_FIFO priority 80 was granted, but the system reports policy other, priority 0"));
+    char core[64];
+    (void)snprintf(core, sizeof core, "core %d was granted, but the system reports %d", ours + 1, ours);
+    CHECK(warned(&granted, core));
+    CHECK(warned(&granted, "mlockall succeeded but VmLck is 0 kB"));
+    CHECK(granted.warnings == 3);
+    CHECK(granted.policy == RT_POLICY_OTHER && granted.core == ours && !granted.mlock);
+    return 0;
+}
+
 static int environment(void) {
     rt_environment before;
     rt_environment after;
     rt_environment_read(&before, true);
-    CHECK(before.minor_faults > 0);
-    CHECK(before.run_delay_ns >= 0 || before.run_delay_ns == -1);
+    struct rusage usage;
+    CHECK(getrusage(RUSAGE_THREAD, &usage) == 0);
+    CHECK(before.minor_faults > 0 && before.minor_faults <= usage.ru_minflt);
+    CHECK(before.vol_switches <= usage.ru_nvcsw && usage.ru_nvcsw - before.vol_switches <= 2);
+    CHECK((before.run_delay_ns >= 0) == (access("/proc/thread-self/schedstat", R_OK) == 0));
+    CHECK((before.steal_ticks >= 0) == (access("/proc/stat", R_OK) == 0));
     static volatile char pages[64 * 4096]; /* never touched so far */
     for (size_t i = 0; i < sizeof pages; i += 4096) {
         pages[i] = 1;
@@ -86,7 +144,7 @@ static int clocks(void) {
 }
 
 int main(void) {
-    if (denormals() || nothing_asked() || impossible_core() || environment() || clocks()) {
+    if (denormals() || nothing_asked() || impossible_core() || granted_without_effect() || environment() || clocks()) {
         return 1;
     }
     puts("ok");
