@@ -12,9 +12,9 @@ _Static_assert((int)CAN_PORT_SKIP_MAX == (int)EST_IO_SKIP_COST, "a skip costs wh
 
 static void begin(void *ctx, int64_t now_ns) {
     est_port *self = ctx;
-    self->drained_ns = self->now_ns;
+    const rt_clock clock = rt_clock_system();
     self->now_ns = now_ns;
-    self->offset_ns = rt_clock_realtime_ns() - now_ns;
+    self->offset_ns = rt_clock_realtime_ns() - clock.now_ns(clock.ctx); /* side by side: now_ns may be long past */
 }
 
 static est_io_status status_of(can_port_status_t status) {
@@ -38,9 +38,13 @@ static est_io_status receive(void *ctx, struct canfd_frame *frame, int64_t *at_n
     est_port *self = ctx;
     int64_t rx_ns = 0;
     const est_io_status status = status_of(can_port_recv(self->port, frame, &rx_ns));
-    /* The wall clock may have been set between stamp and now; but the frame cannot be older than the last look. */
+    if (status == EST_IO_EMPTY) {
+        self->drained_ns = self->now_ns;
+    }
+    /* The wall clock may have been set between stamp and now; but the frame is not older than the last look that found
+     * nothing left, and not of the future. */
     const int64_t at = rx_ns - self->offset_ns;
-    *at_ns = at < self->drained_ns ? self->drained_ns : at;
+    *at_ns = at > self->now_ns ? self->now_ns : at < self->drained_ns ? self->drained_ns : at;
     return status;
 }
 

@@ -5,6 +5,8 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/socket.h>
+#include <sys/syscall.h>
+#include <time.h>
 #include <unistd.h>
 
 #include "est_cycle.h"
@@ -19,13 +21,30 @@
         }                                                                            \
     } while (0)
 
-static const int64_t MS = 1000000;
+enum { MS = 1000000 };
 static est_cycle cycle;
 static est_port state;
 static can_port_t port;
 static est_io io;
 static e2e_sender_t motor_sender;
 static int hub;
+static int64_t wall_shift_s; /* somebody has set the wall clock; the kernel's stamps are from before */
+
+int clock_gettime(clockid_t id, struct timespec *ts) {
+    const int rc = (int)syscall(SYS_clock_gettime, id, ts);
+    ts->tv_sec += id == CLOCK_REALTIME ? (time_t)wall_shift_s : 0;
+    return rc;
+}
+
+static int64_t now_ns(void) {
+    const rt_clock clock = rt_clock_system();
+    return clock.now_ns(clock.ctx);
+}
+
+static void sleep_ms(long ms) {
+    const struct timespec t = {.tv_nsec = ms * MS};
+    CHECK(nanosleep(&t, NULL) == 0);
+}
 
 static void connect_port(void) {
     int pair[2];
@@ -46,7 +65,7 @@ static void disconnect_port(void) {
 }
 
 static void start_cycle(void) {
-    const rt_task_config config = {.period_ns = 100 * MS, .deadline_ns = 100 * MS, .warmup_releases = 5, .virtual_time = true};
+    const rt_task_config config = {.period_ns = 100 * (int64_t)MS, .deadline_ns = 100 * (int64_t)MS, .warmup_releases = 5, .virtual_time = true};
     const rt_clock clock = rt_clock_system();
     const est_identity identity = {.core = -1, .period_us = 100000};
     CHECK(est_cycle_init(&cycle, &config, &clock, est_setting_find("default"), &io, &identity) == EST_CYCLE_OK);
@@ -96,7 +115,65 @@ static void a_storm_of_error_frames_hides_nothing(void) {
     disconnect_port();
 }
 
+static int64_t arrival(void) {
+    struct canfd_frame frame;
+    int64_t at_ns = -1;
+    CHECK(io.recv(io.ctx, &frame, &at_ns) == EST_IO_OK);
+    return at_ns;
+}
+
+static void drain(void) {
+    struct canfd_frame frame;
+    int64_t at_ns;
+    CHECK(io.recv(io.ctx, &frame, &at_ns) == EST_IO_EMPTY);
+}
+
+/* The offset between the clocks is not spoilt by the time between the start of the job and the reading of the clock. */
+static void arrival_is_right_even_if_the_job_was_held_up(void) {
+    connect_port();
+    io.begin(io.ctx, now_ns());
+    drain();
+    sleep_ms(100);
+    const int64_t before = now_ns();
+    put_motor(1);
+    const int64_t start = now_ns();
+    sleep_ms(50);
+    io.begin(io.ctx, start);
+    const int64_t at = arrival();
+    CHECK(at >= before - MS && at <= start && start - at < 40 * (int64_t)MS);
+    disconnect_port();
+}
+
+static void no_arrival_is_of_the_future_or_before_the_last_empty_look(void) {
+    connect_port();
+    const int64_t first = now_ns();
+    io.begin(io.ctx, first);
+    drain();
+    put_motor(1);
+    put_motor(2);
+    sleep_ms(2);
+    wall_shift_s = -3600; /* set back: the stamps lie an hour ahead */
+    const int64_t second = now_ns();
+    io.begin(io.ctx, second);
+    CHECK(arrival() == second);
+    wall_shift_s = 3600; /* set forward; the second frame was left in the queue, so the last empty look is the first */
+    io.begin(io.ctx, now_ns());
+    CHECK(arrival() == first);
+    drain();
+    wall_shift_s = 0;
+    put_motor(3);
+    const int64_t put = now_ns();
+    sleep_ms(2);
+    io.begin(io.ctx, now_ns());
+    const int64_t at = arrival();
+    CHECK(at > second && at <= put + MS); /* right again */
+    disconnect_port();
+}
+
 int main(void) {
+    arrival_is_right_even_if_the_job_was_held_up();
+    no_arrival_is_of_the_future_or_before_the_last_empty_look();
+
     a_storm_of_error_frames_hides_nothing();
     puts("ok");
     return 0;
