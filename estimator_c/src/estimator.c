@@ -6,6 +6,10 @@
 #define RING_MASK (ESTIMATOR_RING - 1)
 #define OFF_GRID_LIMIT 10 /* that many temperature frames off the grid in a row mean the plant moved its grid */
 
+/* A channel that gives nothing for so many intervals after the first node must not keep back the other's estimate. */
+#define START_WAIT 20
+#define FALLBACK_WEIGHT 0.01 /* of a made-up prior: one measurement weighs a thousand times more */
+
 /* Larger magnitudes are no temperature in degC, torque in Nm or speed in rpm but a broken sender; they would wear off
  * only after a hundred thousand windows. */
 #define ABSURD 1.0e6
@@ -38,6 +42,7 @@ static void forget(estimator_t *self)
     }
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         self->innovation[ch] = NAN;
+        self->last_measured_tick[ch] = INT64_MIN / 2; /* never */
     }
 }
 
@@ -211,16 +216,40 @@ static void close_interval(estimator_t *self, int64_t k, bool *stale)
     *bin = (estimator_bin_t){0};
 }
 
-/* Open the MHE's window at node k once each channel has a measurement to start from. */
+/* A channel without any measurement starts at the other's temperature. Held firmly there while nothing else speaks for it
+ * (a problem with nothing to hold it converges slowly); but this prior says little, so that from the first measurement on,
+ * until a window is full of them, it weighs next to nothing. */
+static void fall_back(estimator_t *self, int ch)
+{
+    self->fallback_left[ch] = MHE_NODES;
+    self->mhe.weight_prior[ch] = self->setting.weight_arrival[ch];
+}
+
+static void fallback_measured(estimator_t *self, int ch)
+{
+    const bool last = --self->fallback_left[ch] == 0;
+    self->mhe.weight_prior[ch] = last ? self->setting.weight_prior[ch] : FALLBACK_WEIGHT;
+    self->mhe.weight_arrival[ch] = last ? self->setting.weight_arrival[ch] : FALLBACK_WEIGHT;
+}
+
+/* Open the MHE's window at node k once each channel has a measurement to start from, or one of them and a long wait. */
 static bool start_at(estimator_t *self, int64_t k)
 {
     double prior[MHE_CHANNELS];
+    int known = 0;
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         const double now = self->measured[slot(k)][ch];
-        if (self->early_count[ch] == 0 && isnan(now)) {
-            return false;
-        }
         prior[ch] = self->early_count[ch] > 0 ? self->early_sum[ch] / self->early_count[ch] : now;
+        known += !isnan(prior[ch]);
+    }
+    if (known == 0 || (known < MHE_CHANNELS && k < START_WAIT)) {
+        return false;
+    }
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        if (isnan(prior[ch])) {
+            prior[ch] = prior[1 - ch];
+            fall_back(self, ch);
+        }
     }
     double c[LSTM_HIDDEN] = {0};
     double h[LSTM_HIDDEN] = {0};
@@ -257,6 +286,9 @@ static void measure_newest(estimator_t *self, int64_t k)
         self->measured[slot(k)][ch] = NAN;
         if (!isnan(y)) {
             self->innovation[ch] = mhe_measure(&self->mhe, 0, ch, y);
+            if (self->fallback_left[ch] > 0) {
+                fallback_measured(self, ch);
+            }
         }
     }
 }

@@ -24,7 +24,8 @@ typedef enum {
     ESTIMATOR_INIT = 0,        /* nothing to work on yet */
     ESTIMATOR_STARTING = 1,    /* frames arrive, but no measurement speaks for a known interval yet */
     ESTIMATOR_RUNNING = 2,
-    ESTIMATOR_PREDICTING = 3,  /* no measurement for longer than the setting's timeout: the net alone */
+    ESTIMATOR_PREDICTING = 3,  /* no measurement for longer than the setting's timeout: the net alone. A channel that
+                                * never had one started at the other's temperature */
     ESTIMATOR_INPUT_STALE = 4, /* the newest interval had no motor frame: its input was held */
     ESTIMATOR_INVALID = 5,     /* a result was not finite; the estimator has started again */
 } estimator_status_t;
@@ -71,7 +72,7 @@ typedef struct {
     bool anchored, motor_seen;
     int64_t newest_tick;               /* newest motor tick, unwrapped */
     int64_t newest_temp_tick;
-    int64_t last_measured_tick[MHE_CHANNELS]; /* newest valid measurement */
+    int64_t last_measured_tick[MHE_CHANNELS]; /* newest valid measurement; far below any tick: none yet */
     int64_t grid_tick;
     int64_t next_interval;             /* the first not consumed yet */
     int32_t off_grid_run;              /* temperature frames off the grid in a row */
@@ -85,6 +86,7 @@ typedef struct {
     /* Start. */
     double early_sum[MHE_CHANNELS];    /* measurements that speak for nodes before the first one */
     int32_t early_count[MHE_CHANNELS];
+    int32_t fallback_left[MHE_CHANNELS]; /* measurements to come until a channel that started without any is as good as others */
     bool started;
 
     /* Solution at the newest grid node. */
