@@ -138,9 +138,9 @@ static void put_estimator(FILE *out, const estimator_counters_t *c) {
     (void)fprintf(out,
                   ",\"estimator\":{\"restarts\":%" PRIu32 ",\"held_intervals\":%" PRIu32 ",\"repeated_ticks\":%" PRIu32
                   ",\"invalid_inputs\":%" PRIu32 ",\"off_grid\":%" PRIu32 ",\"late_measurements\":%" PRIu32
-                  ",\"unconverged\":%" PRIu32 "}",
+                  ",\"unconverged\":%" PRIu32 ",\"stray_ticks\":%" PRIu32 "}",
                   c->restarts, c->held_intervals, c->repeated_ticks, c->invalid_inputs, c->off_grid, c->late_measurements,
-                  c->unconverged);
+                  c->unconverged, c->stray_ticks);
 }
 
 static void put_list(FILE *out, const char *name, const uint64_t *values, const char *const *names, size_t count) {

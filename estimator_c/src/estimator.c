@@ -106,6 +106,13 @@ static bool take_tick(estimator_t *self, uint16_t tick16)
     const bool jumped = tick < self->newest_tick || tick - self->newest_tick > most;
     /* Frames may pile up while nobody calls estimator_step(); what can be worked off at once is bounded. */
     const bool piled = self->anchored && interval_of(self, tick) - self->next_interval > self->setting.max_gap_steps;
+    /* One such frame alone is a replay or a stray sender; two in a row are the plant, started again. */
+    if (jumped && !self->tick_jumped) {
+        self->tick_jumped = true;
+        self->counters.stray_ticks++;
+        return false;
+    }
+    self->tick_jumped = false;
     if (jumped || piled) {
         restart_at(self, tick16);
     } else {
@@ -172,6 +179,10 @@ void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc
     /* The grid starts with the last temperature frame before the first motor frame that follows it. */
     const bool waiting = !self->anchored || !self->motor_seen || self->newest_tick <= self->grid_tick;
     if (waiting && (!self->anchored || tick != self->newest_temp_tick)) {
+        if (self->motor_seen && self->newest_tick - tick > (int64_t)ESTIMATOR_TICKS * self->setting.max_gap_steps) {
+            self->counters.late_measurements++; /* so far back no grid may begin: all up to now would be one step's work */
+            return;
+        }
         memset(self->early_sum, 0, sizeof self->early_sum);
         memset(self->early_count, 0, sizeof self->early_count);
         self->anchored = true;

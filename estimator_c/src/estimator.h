@@ -37,13 +37,14 @@ typedef enum {
 
 /* Only grow; never cleared by a restart. */
 typedef struct {
-    uint32_t restarts;         /* tick went backwards or jumped too far, or a result was not finite */
+    uint32_t restarts;         /* tick went backwards or jumped too far twice in a row, or a result was not finite */
     uint32_t held_intervals;   /* intervals without a motor frame */
     uint32_t repeated_ticks;   /* motor frames with the tick of the frame before */
     uint32_t invalid_inputs;   /* motor frames without usable torque and speed */
     uint32_t off_grid;         /* temperature frames whose tick is not on the interval grid */
     uint32_t late_measurements;/* temperature frames that came after their node had left the window */
     uint32_t unconverged;      /* MHE steps that ended at the sweep limit */
+    uint32_t stray_ticks;      /* motor frames not used: tick backwards or too far ahead, the frame before was none */
 } estimator_counters_t;
 
 typedef struct {
@@ -70,6 +71,7 @@ typedef struct {
 
     /* Time. Node k lies at tick grid_tick + 10 k; interval k follows it. */
     bool anchored, motor_seen;
+    bool tick_jumped;                  /* the last motor frame was such a stray */
     int64_t newest_tick;               /* newest motor tick, unwrapped */
     int64_t newest_temp_tick;
     int64_t last_measured_tick[MHE_CHANNELS]; /* newest valid measurement; far below any tick: none yet */
@@ -101,8 +103,9 @@ typedef struct {
 /* Start empty with a copy of `setting`. < 5 us. ESTIMATOR_BAD_SETTING leaves the object unusable. */
 estimator_error_t estimator_init(estimator_t *self, const est_setting_t *setting);
 
-/* Take one MotorState. valid = false (or a value not finite or beyond 1e6): the tick counts, the values do not. A tick that
- * went backwards or more than max_gap_steps intervals ahead restarts the estimator. Never fails. < 0.1 us. */
+/* Take one MotorState. valid = false (or a value not finite or beyond 1e6): the tick counts, the values do not. A frame whose
+ * tick went backwards or more than max_gap_steps intervals ahead is not used; the second in a row restarts the estimator.
+ * Never fails. < 0.1 us. */
 void estimator_feed_motor(estimator_t *self, uint16_t tick16, double torque_nm, double speed_rpm, bool valid);
 
 /* Take one TempMeas as it came from the sensor, offset included. Never fails. < 0.1 us. */

@@ -52,7 +52,7 @@ class Counters(ct.Structure):
     _fields_ = tuple(
         (name, ct.c_uint32)
         for name in ("restarts", "held_intervals", "repeated_ticks", "invalid_inputs", "off_grid",
-                     "late_measurements", "unconverged")
+                     "late_measurements", "unconverged", "stray_ticks")
     )  # fmt: skip
 
 

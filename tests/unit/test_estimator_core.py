@@ -153,13 +153,31 @@ def test_tick_going_backwards_restarts_cleanly(new_tick: int) -> None:
     est = estimator()
     assert run(est, 0, 5000)[-1].status == RUNNING
     feed_tick(est, new_tick, temp=False)
+    assert (est.step().status, est.counters.restarts) == (RUNNING, 0)
+    feed_tick(est, new_tick + 1, temp=False)
     out = est.step()
-    assert est.counters.restarts == 1
-    assert (out.status, out.tick) == (INIT, new_tick)
-    outs = run(est, new_tick + 1, new_tick + 400)
+    assert (est.counters.restarts, est.counters.stray_ticks) == (1, 1)
+    assert (out.status, out.tick) == (INIT, new_tick + 1)
+    outs = run(est, new_tick + 2, new_tick + 400)
     assert outs[-1].status == RUNNING
-    fresh = run(estimator(), new_tick + 1, new_tick + 400)
+    fresh = run(estimator(), new_tick + 2, new_tick + 400)
     assert outs[-1].theta_w_degc == pytest.approx(fresh[-1].theta_w_degc, abs=1e-9)
+
+
+@pytest.mark.parametrize("stray", [1, 4990, 5000 + 900, 5000 + 40_000])
+def test_one_old_frame_changes_nothing(stray: int) -> None:
+    """A replay or a stray sender, as often as it likes, as long as the plant's own frames come between."""
+    est, clean = estimator(), estimator()
+    for e in (est, clean):
+        run(e, 0, 5000)
+    for tick in range(5001, 5201):
+        for e in (est, clean):
+            feed_tick(e, tick)
+        if tick % 7 == 0:
+            est.feed_motor(stray, 300.0, 12000.0)
+        a, b = est.step(), clean.step()
+        assert (a.status, a.tick, a.theta_w_degc, a.theta_r_degc) == (b.status, b.tick, b.theta_w_degc, b.theta_r_degc)
+    assert (est.counters.restarts, est.counters.stray_ticks) == (0, 28)
 
 
 def test_gap_up_to_the_limit_is_bridged_beyond_it_restarts() -> None:
@@ -167,11 +185,23 @@ def test_gap_up_to_the_limit_is_bridged_beyond_it_restarts() -> None:
         est = estimator()
         run(est, 0, 3000)
         outs = run(est, 3000 + gap_ticks, 3000 + gap_ticks)
+        assert est.counters.restarts == 0
+        if restarts == 1:
+            feed_tick(est, 3001 + gap_ticks)
         assert est.counters.restarts == restarts
         if restarts == 0:
             assert outs[-1].intervals == gap_ticks // 10
             assert outs[-1].stale_input
             assert est.counters.held_intervals == gap_ticks // 10 - 1
+
+
+def test_an_old_temperature_frame_starts_no_grid_far_back() -> None:
+    est = estimator()
+    for tick in range(5900, 6001):
+        est.feed_motor(tick, *inputs(tick))
+    est.feed_temp(1000, *temperatures(1000))
+    assert (est.step().intervals, est.counters.late_measurements) == (0, 1)
+    assert run(est, 6001, 6200)[-1].status == RUNNING
 
 
 def test_backlog_is_bounded_when_nobody_steps() -> None:
