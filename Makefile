@@ -1,6 +1,8 @@
 # make run    the main job: sixty seconds of plant and estimator over CAN, judged, logged, drawn
 # make test   every test, on every bus this machine can have
 # make check  ruff, pyright, import rules, DBC lint
+# make bench  plant step, MHE step, bus: times and instruction counts
+# make train  data set from the plant, then the net (about ten minutes)
 # make setup  .venv with rt-runner in it, and the C built
 SHELL  := /bin/bash
 PYTHON ?= python3.11
@@ -43,8 +45,8 @@ build-asan: $(VENV)/.base
 # ---- the main job -----------------------------------------------------------------------------------------
 run: setup
 	@mkdir -p logs
-	$(RT) run hot-lap --log logs/hot-lap.mcap --json logs/hot-lap.json
-	$(RT) report logs/hot-lap.mcap -o logs/hot-lap.html
+	@$(RT) run hot-lap --log logs/hot-lap.mcap --json logs/hot-lap.json; verdict=$$?; \
+	if [ -f logs/hot-lap.mcap ]; then $(RT) report logs/hot-lap.mcap -o logs/hot-lap.html; fi; exit $$verdict
 
 # ---- proof ------------------------------------------------------------------------------------------------
 test: $(VENV)/.dev build build-asan
@@ -55,6 +57,11 @@ check: $(VENV)/.dev
 	$(VENV)/bin/pyright
 	$(VENV)/bin/lint-imports
 	$(PY) -m rt_runner.lint_dbc dbc/drive.dbc
+
+bench: $(VENV)/.dev build
+	$(PY) -m tools.bench_plant
+	$(PY) -m tools.bench_mhe
+	$(PY) -m tools.bench_bus --bus hub
 
 train: $(VENV)/.dev
 	$(PY) -m tools.dataset --set R --seed 1 --out build/data/R.npz

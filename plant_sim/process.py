@@ -1,6 +1,7 @@
 """The plant as a process: the model advanced on a clock and published on a bus, or in lock-step over pipes."""
 
 import copy
+import errno
 import gc
 import hashlib
 import json
@@ -22,6 +23,7 @@ from rt_runner.errors import SetupError
 from rt_runner.records import END, TICK, control, pack, read_until_control
 
 TICK_NS = 10_000_000
+TX_PATIENCE = 100  # tries of 0.1 s each
 TICKS_PER_INTERVAL = 10  # lock-step advances by 0.1 s
 
 
@@ -80,7 +82,7 @@ def run_realtime(args) -> int:
                     break
         except can.CanOperationError as e:
             raise SetupError(
-                f"bus {args.bus} was lost at tick {plant.tick}: {e}; see the other processes' last words"
+                f"sending on {args.bus} failed at tick {plant.tick}: {e}; see what the other processes said last"
             ) from e
         _say(
             {
@@ -95,15 +97,15 @@ def run_realtime(args) -> int:
 
 
 def _send(bus: can.BusABC, message: can.Message, publisher: Publisher) -> None:
-    for _ in range(200):
+    for _ in range(TX_PATIENCE):
         try:
             return bus.send(message, timeout=0.1)
         except can.CanOperationError as e:
-            if getattr(e, "error_code", None) not in (11, 105):  # EAGAIN, ENOBUFS: the queue is full, not gone
+            if e.error_code not in (errno.EAGAIN, errno.ENOBUFS):  # the queue is full: the bus is still there
                 raise
             publisher.tx_retries += 1
             time.sleep(0.0005)
-    raise can.CanOperationError("transmit queue stayed full")
+    raise can.CanOperationError(f"no room to send for {TX_PATIENCE} tries: nobody takes our frames off the bus")
 
 
 def run_lockstep(args, inp: BinaryIO, out: BinaryIO) -> int:

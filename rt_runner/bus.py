@@ -171,7 +171,7 @@ class HubProcess:
         The binary is missing or did not start; nothing is left behind.
     """
 
-    def __init__(self, stall_s: float = 2.0) -> None:
+    def __init__(self, stall_s: float = 2.0, cores: set[int] | None = None) -> None:
         binary = paths.binary("rt_hub")
         self.counters: dict = {}
         self._folder = runtime_dir()
@@ -179,7 +179,7 @@ class HubProcess:
         self.child: Child | None = None
         try:
             command = [str(binary), "--socket", str(self.socket_path), "--stall-s", f"{stall_s:g}"]
-            self.child = Child("hub", command)
+            self.child = Child("hub", command, cores)
             self.child.wait_line("ready", _HUB_READY_S)
         except BaseException:
             self.stop()
@@ -214,15 +214,17 @@ class HubProcess:
 
     @staticmethod
     @contextlib.contextmanager
-    def serving(choice: BusChoice, say: Callable[[str], None] | None = None) -> Iterator[str]:
+    def serving(
+        choice: BusChoice, say: Callable[[str], None] | None = None, cores: set[int] | None = None
+    ) -> Iterator[str]:
         """Have the chosen bus for the length of a ``with``: start the hub if it is one, give the bus string.
 
-        ``say`` is told in one line if the hub was lost or had to disconnect a client.
+        ``say`` is told in one line if the hub was lost or had to disconnect a client; ``cores`` are those of the hub.
         """
         if choice.kind != "rt_hub" or choice.channel:
             yield choice.bus
             return
-        hub = HubProcess()
+        hub = HubProcess(cores=cores)
         try:
             yield hub.bus
         finally:

@@ -17,6 +17,31 @@ _PR_SET_PDEATHSIG = 1
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
+def spawn(command: list[str], cores: set[int] | None = None) -> subprocess.Popen:
+    """Start a process with pipes on all three streams, on ``cores``, that ends when we do.
+
+    It gets a session of its own: Ctrl-C reaches us alone, and we end the others in order. What lies in the working
+    folder cannot stand in for a module of ours.
+    """
+
+    def in_child() -> None:
+        # Who is killed takes his children along; nobody is left sending on the bus.
+        _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        if cores:
+            with contextlib.suppress(OSError):
+                os.sched_setaffinity(0, cores)
+
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        preexec_fn=in_child,
+        env={**os.environ, "PYTHONSAFEPATH": "1"},
+    )
+
+
 class ChildError(RtError):
     """A child process ended, or stayed silent, when it should not have."""
 
@@ -36,23 +61,8 @@ class Child:
         self.lines: queue.Queue[dict | None] = queue.Queue()
         self._words: deque[str] = deque(maxlen=20)
 
-        def in_child() -> None:
-            # A supervisor that is killed takes its children along; nobody is left sending on the bus.
-            _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-            if cores:
-                with contextlib.suppress(OSError):
-                    os.sched_setaffinity(0, cores)
-
         try:
-            # A session of its own: Ctrl-C reaches the supervisor alone, which then ends the others in order.
-            self.process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                start_new_session=True,
-                preexec_fn=in_child,
-            )
+            self.process = spawn(command, cores)
         except OSError as e:
             raise SetupError(f"cannot start the {name}: {command[0]}: {e.strerror}") from e
         self._readers = [
@@ -66,8 +76,12 @@ class Child:
         assert self.process.stdout is not None
         for raw in self.process.stdout:
             try:
-                self.lines.put(json.loads(raw))
+                line = json.loads(raw)
             except ValueError:
+                line = None
+            if isinstance(line, dict):
+                self.lines.put(line)
+            else:
                 self._words.append(raw.decode(errors="replace").rstrip())
         self.lines.put(None)
 
@@ -103,7 +117,7 @@ class Child:
                 continue
             if line is None:
                 raise ChildError(self.obituary())
-            if isinstance(line, dict) and key in line:
+            if key in line:
                 return line
         raise ChildError(f"stopped while waiting for the {self.name}")
 

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import io
 import os
 import signal
 import sys
@@ -35,17 +36,27 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit status."""
-    args = build_parser().parse_args(argv)
+    debug = False
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without a degree sign is no reason to fail
     try:
+        args = build_parser().parse_args(argv)
+        debug = args.debug
         return args.run(args)
     except RtError as e:
-        if args.debug:
+        if debug:
             raise
         print(f"rt-runner: {e}", file=sys.stderr)
         return e.exit_code
     except BrokenPipeError:  # `rt-runner inspect LOG | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
+    except OSError as e:  # a path nobody foresaw: too long, not searchable ...
+        if debug:
+            raise
+        print(f"rt-runner: {e.filename or 'system'}: {e.strerror or e} (--debug shows where)", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
 

@@ -9,6 +9,8 @@ from pathlib import Path
 from rt_runner.errors import UsageError
 from rt_runner.result import Limits
 
+TICK_S = 0.01  # the plant's step
+START_MAX_S = 10_800.0
 SCENARIO_DIR = Path(__file__).parent / "scenarios"
 
 
@@ -70,7 +72,7 @@ def load_scenario(name_or_path: str) -> Scenario:
     path = SCENARIO_DIR / f"{name_or_path}.toml"
     if name_or_path.endswith(".toml") or "/" in name_or_path:
         path = Path(name_or_path)
-    elif not path.is_file():
+    elif name_or_path not in scenario_names():
         raise UsageError(
             f"unknown scenario '{name_or_path}': choose one of {', '.join(scenario_names())}, "
             "or give the path of a .toml file"
@@ -128,8 +130,12 @@ def _check(s: Scenario) -> None:
         refuse(f"[cycle] kind = '{s.cycle.kind}' is none of lap, class3, csv")
     if (s.cycle.kind == "csv") != (s.cycle.path is not None):
         refuse('[cycle] path belongs to kind = "csv", and that kind needs it')
-    if not (0 <= s.duration_s < math.inf and 0 <= s.cycle.start_s < math.inf):
-        refuse("duration_s and [cycle] start_s must be 0 or more")
+    if s.cycle.path is not None and not (s.path.parent / s.cycle.path).is_file():
+        refuse(f"[cycle] path: no file {s.path.parent / s.cycle.path}")
+    if not (s.duration_s == 0 or TICK_S <= s.duration_s < math.inf):
+        refuse(f"duration_s must be 0 (to the end of the cycle), or {TICK_S:g} s or more")
+    if not 0 <= s.cycle.start_s <= START_MAX_S:
+        refuse(f"[cycle] start_s must lie in 0 … {START_MAX_S:g}: the plant is driven up to there before the start")
     if not -40 <= s.cycle.theta0_degc <= 200:
         refuse("[cycle] theta0_degc must lie in -40 … 200")
     if not (0 <= s.sensor.variance < math.inf and 0 <= s.sensor.delay_s <= 10 and abs(s.sensor.offset_degc) <= 100):
@@ -152,6 +158,6 @@ def with_duration(s: Scenario, duration_s: float | None) -> Scenario:
     """The scenario with its duration replaced, where one is given."""
     if duration_s is None:
         return s
-    if not 0 < duration_s < math.inf:
-        raise UsageError(f"--duration {duration_s:g}: must be positive seconds")
+    if not TICK_S <= duration_s < math.inf:
+        raise UsageError(f"--duration {duration_s:g}: must be {TICK_S:g} s or more")
     return replace(s, duration_s=duration_s)

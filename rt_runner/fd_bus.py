@@ -110,8 +110,8 @@ class FdBus(can.BusABC):
         """Give the descriptor, for Notifier, asyncio, select."""
         return self.socket.fileno()
 
-    def _gone(self, why: str) -> can.CanOperationError:
-        return can.CanOperationError(f"{self.channel_info}: {why}")
+    def _gone(self, why: str, error_code: int | None = None) -> can.CanOperationError:
+        return can.CanOperationError(f"{self.channel_info}: {why}", error_code)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         """Read one message; unusable datagrams are counted and skipped."""
@@ -200,7 +200,7 @@ class FdBus(can.BusABC):
                     raise self._gone(e.strerror or str(e)) from e
                 left_s = None if deadline is None else deadline - time.monotonic()
                 if left_s is not None and left_s <= 0:
-                    raise self._gone(f"no room to send within {timeout:g} s") from e
+                    raise self._gone(f"no room to send within {timeout:g} s", e.errno) from e
                 if e.errno == errno.ENOBUFS:
                     time.sleep(_ENOBUFS_WAIT_S)
                 else:

@@ -78,7 +78,15 @@ def _tail(summary: LogSummary) -> list[str]:
         lines.append("attachments: " + ", ".join(f"{n} ({b} bytes)" for n, b in summary.attachments.items()))
     if summary.run:
         lines.append("run: " + ", ".join(f"{k}={v}" for k, v in summary.run.items()))
-    return lines + _verdict(summary.result)
+    return lines + _verdict(summary.result) + _recomputed(summary.differences)
+
+
+def _recomputed(differences: list[str] | None) -> list[str]:
+    if differences is None:
+        return []
+    if differences:
+        return [f"recomputed from the frames: ANOTHER RESULT in {', '.join(differences)}"]
+    return ["recomputed from the frames: the same result"]
 
 
 def _verdict(result: dict[str, Any] | None) -> list[str]:

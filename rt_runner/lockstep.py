@@ -2,20 +2,20 @@
 
 import contextlib
 import json
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from rt_runner import paths
+from rt_runner.children import spawn
 from rt_runner.config import Scenario
-from rt_runner.dbc import load_dbc
+from rt_runner.dbc import Dbc
 from rt_runner.errors import RtError, SetupError
-from rt_runner.mcap_log import LogWriter
+from rt_runner.mcap_log import LogError, LogWriter
+from rt_runner.provenance import Provenance
 from rt_runner.records import CONTROL_ID, END, TICK, Record, control, pack, read_until_control
 from rt_runner.result import ResultAccumulator, RunFacts
-from rt_runner.supervisor import check_same_dbc, log_config
 
 PROGRESS_NS = 1_000_000_000
 
@@ -26,9 +26,7 @@ class _Peer:
     def __init__(self, name: str, command: list[str]) -> None:
         self.name = name
         self._words: list[str] = []
-        self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
-        )  # Ctrl-C is ours to handle
+        self.process = spawn(command)
 
     def exchange(self, chunk: bytes) -> list[Record]:
         """Send ``chunk``, which ends with a control record, and read up to the answering control record."""
@@ -50,19 +48,6 @@ class _Peer:
             except ValueError:
                 self._words.append(raw.decode(errors="replace").strip())
 
-    def ready(self) -> dict:
-        """What it says about itself before the first record.
-
-        Raises
-        ------
-        SetupError
-            It ended instead.
-        """
-        for line in self.json_lines():
-            if "ready" in line:
-                return line
-        raise SetupError(self.obituary())
-
     def obituary(self) -> str:
         """One line on how it ended."""
         for _ in self.json_lines():
@@ -81,10 +66,13 @@ class _Peer:
                     stream.close()
 
 
-def run_lockstep(scenario: Scenario, seed: int, log: Path, progress: Callable[[dict], None]) -> dict:
+def run_lockstep(
+    scenario: Scenario, seed: int, log: Path, dbc: Dbc, provenance: Provenance, progress: Callable[[dict], None]
+) -> dict:
     """Run ``scenario`` in lock-step.
 
     Record time starts at 0 and is simulated time, so the same scenario and seed give the same frames.
+    A KeyboardInterrupt ends the run early; what there is until then is logged and judged.
 
     Returns
     -------
@@ -93,36 +81,20 @@ def run_lockstep(scenario: Scenario, seed: int, log: Path, progress: Callable[[d
 
     Raises
     ------
-    RtError
-        A process ended early; the log up to there is complete and readable.
+    SetupError
+        The plant refused the scenario (there is no log then), or the log cannot be written on.
     """
-    dbc = load_dbc()
-    plant_command = [
-        sys.executable,
-        "-m",
-        "plant_sim",
-        "--lockstep",
-        "--scenario",
-        str(scenario.path),
-        "--seed",
-        str(seed),
-    ]
+    e = scenario.estimator
+    plant_command = [sys.executable, "-m", "plant_sim", "--lockstep", "--scenario", str(scenario.path)]
+    plant_command += ["--seed", str(seed)]
     if scenario.duration_s:
         plant_command += ["--duration", str(scenario.duration_s)]
-    estimator_command = [
-        str(paths.binary("rt_estimator")),
-        "--lockstep",
-        "--setting",
-        scenario.estimator.setting,
-        "--period-us",
-        str(round(scenario.estimator.period_s * 1e6)),
-        "--no-rt",
-    ]
-    config = log_config(scenario, "lockstep", seed)
+    estimator_command = [str(paths.binary("rt_estimator")), "--lockstep", "--no-rt", "--setting", e.setting]
+    estimator_command += ["--period-us", str(round(e.period_s * 1e6))]
     facts = RunFacts(
         bus="lockstep",
         scenario=scenario.name,
-        period_s=scenario.estimator.period_s,
+        period_s=e.period_s,
         lockstep=True,
         seed=seed,
         limits=scenario.limits,
@@ -130,22 +102,27 @@ def run_lockstep(scenario: Scenario, seed: int, log: Path, progress: Callable[[d
     accumulator = ResultAccumulator()
     peers: list[_Peer] = []
     try:
-        plant = _Peer("plant", plant_command)
-        peers.append(plant)
-        estimator = _Peer("estimator", estimator_command)
-        peers.append(estimator)
-        granted = estimator.ready()
-        check_same_dbc(granted, dbc)
-        with LogWriter(log, dbc, config["run"], config["attachments"]) as writer:
+        for name, command in (("plant", plant_command), ("estimator", estimator_command)):
+            peers.append(_Peer(name, command))
+        plant, estimator = peers
+        try:
+            first = plant.exchange(control(0, TICK))
+        except RtError as error:
+            raise SetupError(str(error)) from None
+        granted = next((line for line in estimator.json_lines() if "ready" in line), {})
+        attachments = {**provenance.files, **{k: v.encode() for k, v in provenance.texts.items()}}
+        with LogWriter(log, dbc, provenance.run, attachments) as writer:
             try:
-                _shuttle(plant, estimator, writer, accumulator, progress)
-            except RtError as e:
-                facts = replace(facts, crash=str(e), stopped_by="crash")
+                _shuttle(first, plant, estimator, writer, accumulator, progress)
+            except LogError:
+                raise
+            except RtError as error:
+                facts = replace(facts, crash=str(error), stopped_by="crash")
             except KeyboardInterrupt:
                 facts = replace(facts, stopped_by="interrupt")
-            result = accumulator.result(replace(facts, granted=granted))
-            writer.attach("granted.json", json.dumps(granted, sort_keys=True).encode())
-            writer.metadata("result", {"json": json.dumps(result)})
+            facts = replace(facts, granted=granted)
+            result = accumulator.result(facts)
+            writer.seal(asdict(facts), result)
     finally:
         for peer in peers:
             peer.close()
@@ -153,9 +130,14 @@ def run_lockstep(scenario: Scenario, seed: int, log: Path, progress: Callable[[d
 
 
 def _shuttle(
-    plant: _Peer, estimator: _Peer, writer: LogWriter, accumulator: ResultAccumulator, progress: Callable[[dict], None]
+    answer: list[Record],
+    plant: _Peer,
+    estimator: _Peer,
+    writer: LogWriter,
+    accumulator: ResultAccumulator,
+    progress: Callable[[dict], None],
 ) -> None:
-    """Carry the frames until the plant's cycle ends."""
+    """Carry the frames until the plant's cycle ends; ``answer`` is the plant's first."""
     newest: dict[str, float | None] = {}
 
     def take(records: list[Record]) -> None:
@@ -166,13 +148,14 @@ def _shuttle(
                     accumulator.feed(r.t_ns, decoded.name, decoded.values, decoded.e2e)
                     newest.update(decoded.values)
 
-    t_ns, code = 0, TICK
-    while code != END:
-        answer = plant.exchange(control(t_ns, TICK))
+    while True:
         t_ns, code = answer[-1].t_ns, answer[-1].data[0]
         take(answer)
         take(estimator.exchange(b"".join(pack(*r) for r in answer[:-1]) + control(t_ns, TICK)))
         if t_ns % PROGRESS_NS == 0:
             shown = {k: newest.get(k) for k in ("theta_w_est_degc", "theta_w_true_degc")}
             progress({"t_s": t_ns / 1e9, "frames": writer.frames, **shown})
+        if code == END:
+            break
+        answer = plant.exchange(control(t_ns, TICK))
     take(estimator.exchange(control(t_ns, END)))

@@ -8,6 +8,7 @@ from typing import Any
 
 from rt_runner.e2e import COUNTER_MASK, E2eStatus
 from rt_runner.log_reader import LogReader
+from rt_runner.result import ResultAccumulator, RunFacts
 
 RATE_TOLERANCE = 0.05  # a period further off its cycle than this is pointed out
 MIN_PERIODS = 5  # ... once there are this many periods to judge
@@ -68,6 +69,7 @@ class LogSummary:
     attachments: dict[str, int] = field(default_factory=dict)  # name -> bytes
     run: dict[str, str] = field(default_factory=dict)
     result: dict[str, Any] | None = None
+    differences: list[str] | None = None  # where the result, recomputed from the frames, is another; None: no result
 
     @property
     def duration_s(self) -> float:
@@ -117,7 +119,9 @@ def summarise(path: str | Path) -> LogSummary:
     reader = LogReader(path)
     running = {name: _Running(m) for name, m in _messages(reader).items()}
     summary = LogSummary(str(path), reader.size, reader.complete, reader.trouble)
+    accumulator = ResultAccumulator()
     for frame in reader.frames():
+        accumulator.feed(frame.t_ns, frame.name, frame.values, frame.e2e)
         one = running.get(frame.name)
         if one is not None:
             one.add(frame.t_ns, frame.values.get("counter"), frame.e2e)
@@ -133,7 +137,25 @@ def summarise(path: str | Path) -> LogSummary:
     summary.attachments = {name: len(data) for name, data in reader.attachments.items()}
     summary.run = reader.metadata.get("run", {})
     summary.result = result_of(reader.metadata)
+    facts = _facts(reader.metadata)
+    if summary.result is not None and facts is not None:
+        summary.differences = _differences(summary.result, json.loads(json.dumps(accumulator.result(facts))))
     return summary
+
+
+def _facts(metadata: Mapping[str, Mapping[str, str]]) -> RunFacts | None:
+    try:
+        return RunFacts.from_dict(json.loads(metadata["facts"]["json"]))
+    except (KeyError, ValueError, TypeError, AttributeError):
+        return None
+
+
+def _differences(stored: Any, again: Any, where: str = "") -> list[str]:
+    """Names of the figures that differ, as ``a.b.c``."""
+    if isinstance(stored, dict) and isinstance(again, dict):
+        names = [k for k in again if k in stored]  # what another version of the runner adds is no difference
+        return [d for k in names for d in _differences(stored[k], again[k], f"{where}.{k}" if where else k)]
+    return [] if stored == again else [where]
 
 
 def result_of(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, Any] | None:

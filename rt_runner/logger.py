@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +44,14 @@ _PROGRESS = ("theta_w_est_degc", "theta_w_true_degc", "resp_us")
 class Config:
     """What the supervisor says about the run before it starts."""
 
-    run: dict[str, Any]
-    attachments: dict[str, str]
+    run: dict[str, Any] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)  # attachments: name -> path
+    texts: dict[str, str] = field(default_factory=dict)  # attachments: name -> text
+    facts: dict[str, Any] = field(default_factory=dict)  # `RunFacts` as far as they are known before the start
 
     @staticmethod
     def load(path: Path) -> "Config":
-        """Read ``{"run": {...}, "attachments": {name: path}}``.
+        """Read ``{"run": {...}, "files": {name: path}, "texts": {name: text}, "facts": {...}}``, each optional.
 
         Raises
         ------
@@ -57,11 +59,11 @@ class Config:
         """
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
-            return Config(dict(values.get("run", {})), dict(values.get("attachments", {})))
+            return Config(**{name: dict(values.get(name, {})) for name in ("run", "files", "texts", "facts")})
         except OSError as e:
             raise UsageError(f"{path}: cannot read the logger's configuration ({e.strerror})") from None
         except (ValueError, TypeError, AttributeError):
-            raise UsageError(f'{path}: must be JSON, {{"run": {{...}}, "attachments": {{...}}}}') from None
+            raise UsageError(f'{path}: must be JSON, {{"run": {{...}}, "files": {{...}}, ...}}') from None
 
 
 class Control:
@@ -119,9 +121,13 @@ class Logger:
         say: Callable[[dict], None],
         clock: Callable[[], float] = time.monotonic,
         wall_ns: Callable[[], int] = time.time_ns,
+        known: RunFacts | None = None,
     ) -> None:
         self._wall_ns = wall_ns
         self._bus, self._writer, self._control, self._say, self._clock = bus, writer, control, say, clock
+        self._known = known or RunFacts()
+        self._parent = os.getppid()
+        self._cut_short = False
         self._accumulator = ResultAccumulator()
         self._newest: dict[str, float | None] = {}
         self._first_ns: int | None = None
@@ -139,8 +145,7 @@ class Logger:
         self._drain()
         facts = self._facts(finish)
         result = self._accumulator.result(facts)
-        self._writer.attach("granted.json", json.dumps(facts.granted, sort_keys=True).encode())
-        self._writer.metadata("result", {"json": json.dumps(result)})
+        self._writer.seal(asdict(facts), result)
         return result
 
     def _until_told(self) -> dict:
@@ -201,20 +206,29 @@ class Logger:
         with contextlib.suppress(can.CanError):
             while self._take(DRAIN_QUIET_S) and self._now_ns < last_ns:
                 if self._clock() > deadline:
-                    self._say(
-                        {"error": f"{DRAIN_MAX_S:g} s were not enough to log what had arrived: frames are missing"}
-                    )
+                    self._cut_short = True
                     return
 
     def _facts(self, told: dict) -> RunFacts:
         dropped = _dropped(self._bus)
         if "finish" not in told:
             crash = told.get("why") or "the supervisor ended without finishing the run"
-            stopped_by = told["stop"]
-            return RunFacts(stopped_by=stopped_by, crash=crash if stopped_by == "crash" else None, log_dropped=dropped)
+            stopped_by = "crash" if os.getppid() != self._parent else told["stop"]
+            return replace(
+                self._known,
+                stopped_by=stopped_by,
+                crash=crash if stopped_by == "crash" else None,
+                log_dropped=dropped,
+                log_cut_short=self._cut_short,
+            )
         finish = told["finish"]
         facts = RunFacts.from_dict(finish.get("outcome") or {})
-        return replace(facts, granted=finish.get("granted") or facts.granted, log_dropped=facts.log_dropped + dropped)
+        return replace(
+            facts,
+            granted=finish.get("granted") or facts.granted,
+            log_dropped=facts.log_dropped + dropped,
+            log_cut_short=self._cut_short,
+        )
 
 
 def _dropped(bus: can.BusABC) -> int:
@@ -251,14 +265,15 @@ def _say(line: dict) -> None:
 def _run(args: argparse.Namespace) -> None:
     from rt_runner.bus import open_bus
 
-    config = Config.load(args.config) if args.config else Config({}, {})
+    config = Config.load(args.config) if args.config else Config()
+    attachments = {**config.files, **{name: text.encode() for name, text in config.texts.items()}}
     control = Control()
     bus = open_bus(args.bus)
     try:
-        with LogWriter(args.log, load_dbc(args.dbc), config.run, config.attachments, force=args.force) as writer:
+        with LogWriter(args.log, load_dbc(args.dbc), config.run, attachments, force=args.force) as writer:
             control.listen(sys.stdin.fileno())
             _say({"ready": True})
-            result = Logger(bus, writer, control, _say).run()
+            result = Logger(bus, writer, control, _say, known=RunFacts.from_dict(config.facts)).run()
     finally:
         bus.shutdown()
     _say({"result": result})

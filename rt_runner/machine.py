@@ -4,6 +4,8 @@ import os
 import platform
 from pathlib import Path
 
+from rt_runner.errors import UsageError
+
 
 def split_cores(wanted: int | None = None) -> tuple[int, set[int]]:
     """The estimator's core and the cores of everything else.
@@ -14,6 +16,19 @@ def split_cores(wanted: int | None = None) -> tuple[int, set[int]]:
     allowed = os.sched_getaffinity(0)
     core = wanted if wanted is not None else max(allowed)
     return core, (allowed - {core}) or allowed
+
+
+def check_core(core: int | None) -> None:
+    """Refuse a core that this process may not use.
+
+    Raises
+    ------
+    UsageError
+        Its number is none of the allowed ones.
+    """
+    allowed = sorted(os.sched_getaffinity(0))
+    if core is not None and core not in allowed:
+        raise UsageError(f"--core {core}: this process may use {', '.join(map(str, allowed))}")
 
 
 def steal_ms(core: int) -> float | None:

@@ -8,11 +8,14 @@ time calls ``flush`` when he wants what is buffered on the disk. Reading is in `
 import contextlib
 import errno
 import fcntl
+import json
 import os
+import stat
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
@@ -41,6 +44,8 @@ class _Disk:
         self.failed = False
 
     def write(self, data: bytes) -> int:
+        if self.failed:
+            raise LogError(f"{self._path}: the log ended earlier, nothing more is written to it")
         view, done = memoryview(data), 0
         try:
             while done < len(view):
@@ -96,7 +101,7 @@ def _open(path: Path, force: bool) -> int:
             raise LogError(f"{path}: is a directory; give a file name with --log") from None
         if _is_locked(path):
             raise LogError(f"{path}: another logger writes it; choose another file with --log") from None
-        raise LogError(f"{path}: exists already; choose another file, or --force to overwrite it") from None
+        raise LogError(f"{path}: exists already; choose another file") from None
     except OSError as e:
         raise LogError(f"{path}: cannot write the log ({e.strerror}); {_advice(e)}") from None
     try:
@@ -122,9 +127,12 @@ def prepare_log_path(path: Path | None, stem: str) -> Path:
     """
     if path is None:
         path = Path("logs") / f"{stem}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
-    if path.is_dir():
-        raise LogError(f"{path}: is a directory; give a file name, such as {path / (stem + '.mcap')}")
     try:
+        mode = path.stat().st_mode if path.exists() else stat.S_IFREG
+        if stat.S_ISDIR(mode):
+            raise LogError(f"{path}: is a directory; give a file name, such as {path / (stem + '.mcap')}")
+        if not stat.S_ISREG(mode):
+            raise LogError(f"{path}: is no ordinary file; a log needs one, choose another with --log")
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists():
             if _is_locked(path):
@@ -231,6 +239,12 @@ class LogWriter:
         """Add an attachment, stamped with the newest frame's time."""
         media = _MEDIA.get(Path(name).suffix, "application/octet-stream")
         self._writer.add_attachment(0, self._last_ns, name, media, data)
+
+    def seal(self, facts: Mapping[str, Any], result: Mapping[str, Any]) -> None:
+        """Write what ends a run: what was granted, the facts no frame can tell, and the result (JSON each)."""
+        self.attach("granted.json", json.dumps(facts.get("granted", {}), sort_keys=True).encode())
+        self.metadata("facts", {"json": json.dumps(facts, sort_keys=True)})
+        self.metadata("result", {"json": json.dumps(result)})
 
     def flush(self) -> None:
         """Hand everything so far to the operating system: a killed process loses nothing of it."""

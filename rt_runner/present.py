@@ -1,6 +1,7 @@
 """What a run shows its user: a progress line on a terminal, lines elsewhere, the result at the end."""
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -55,15 +56,15 @@ class Progress:
 
 
 def deliver(result: dict, log: Path, json_file: str | None) -> int:
-    """Print the result, write it where asked; returns the exit status.
+    """Print the result, then write it where asked; returns the exit status.
 
     Raises
     ------
     UsageError
         The JSON file cannot be written.
     """
+    print(summary(result, log), file=sys.stderr if json_file == "-" else sys.stdout, flush=True)
     write_json(result, json_file)
-    print(summary(result, log), file=sys.stderr if json_file == "-" else sys.stdout)
     crashed = any(f["what"] == "run" and f["verdict"] == "fail" for f in result["findings"])
     return 1 if crashed else EXIT[result["verdict"]]
 
@@ -78,11 +79,33 @@ def write_json(figures: dict, json_file: str | None) -> None:
         return
     path = Path(json_file)
     try:
+        if path.exists() and not path.is_file():
+            path.write_text(text)  # a device or a pipe is written to, never replaced
+            return
         part = path.with_name(path.name + ".part")
         part.write_text(text)
         part.replace(path)
-    except OSError as e:
-        raise UsageError(f"cannot write --json {json_file}: {e.strerror}") from e
+    except (OSError, ValueError) as e:
+        raise UsageError(f"cannot write --json {json_file!r}: {getattr(e, 'strerror', None) or e}") from e
+
+
+def check_json_path(json_file: str | None, log: str | None) -> None:
+    """Refuse before a run what could not be written after it.
+
+    Raises
+    ------
+    UsageError
+        No such folder, a folder itself, or the log's own path.
+    """
+    if json_file in (None, "-"):
+        return
+    path = Path(json_file)
+    if not path.name or path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise UsageError(
+            f"cannot write --json {json_file!r}: give a file in a folder that exists and may be written to"
+        )
+    if log is not None and path.resolve() == Path(log).resolve():
+        raise UsageError(f"--json and --log are the same file {json_file}: give two")
 
 
 def summary(result: dict, log: Path | None) -> str:

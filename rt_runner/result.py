@@ -6,16 +6,16 @@ the report when they read. What no frame can tell (which bus, who crashed, stole
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 from rt_runner.judge import Finding, judge_misses, overall, percentile
 
 TICK_S = 0.01
 TICK_BITS = 16
 RELEASE_BITS = 24
+RELEASES_LAST, SKIPPED_LAST = (1 << 24) - 2, (1 << 16) - 2  # counters stop at their last valid code
 SETTLE_S = 10.0  # accuracy is judged from here after the first estimate: the net's memory starts empty
-E2E_DAMAGED = (3, 4)  # wrong sequence, wrong CRC: such a frame is counted, never believed
-E2E_STATES = ("ok", "repeated", "lost", "wrong_sequence", "wrong_crc")
+REPEATED, WRONG_CRC = 1, 4  # E2E states as in the log
 STATUS_SHOWN = ("init", "starting", "ok", "predicting", "input_stale", "invalid")
 CAUSES = ("none", "late_wake", "preempted", "long_compute", "stale_input", "blocked_send")
 MACHINE_CAUSES = ("late_wake", "preempted")
@@ -46,6 +46,7 @@ class RunFacts:
     limits: Limits = field(default_factory=Limits)
     steal_ms: float | None = None
     log_dropped: int = 0  # frames the kernel or the hub dropped before the logger saw them
+    log_cut_short: bool = False  # the logger could not take all that had arrived
 
     @staticmethod
     def from_dict(values: dict) -> "RunFacts":
@@ -100,7 +101,7 @@ class ResultAccumulator:
         self._releases: list[int] = []
         self._late = self._warmup_jobs = self._warmup_misses = self._stale_jobs = 0
         self._causes: dict[str, int] = dict.fromkeys(CAUSES, 0)
-        self._skips_by_cause: dict[str, int] = dict.fromkeys(CAUSES, 0)
+        self._judged_causes: dict[str, int] = dict.fromkeys(CAUSES, 0)
         self._skipped = 0
         self._in_warmup = self._was_late = False
         self._wake_us: list[float] = []
@@ -126,13 +127,13 @@ class ResultAccumulator:
         self._frames += 1
         self._first_ns = t_ns if self._first_ns is None else self._first_ns
         self._last_ns = max(self._last_ns, t_ns)
-        if e2e == 4:
+        if e2e == WRONG_CRC:
             self._damaged += 1
             return
         counter = values.get("counter")
         if counter is not None:
             before = self._counter.get(name)
-            if before is not None and e2e != 1:  # a repeat is no gap
+            if before is not None and e2e != REPEATED:  # a repeat is no gap
                 self._lost += (int(counter) - before - 1) % 16
             self._counter[name] = int(counter)
         handler = getattr(self, f"_on_{name}", None)
@@ -212,17 +213,20 @@ class ResultAccumulator:
             return
         release = self._release(v["release_index"])
         warmup, late = bool(v.get("warmup")), bool(v.get("miss_late"))
-        skipped = release - self._releases[-1] - 1 if self._releases else 0
-        if skipped > 0:
+        skipped = 0
+        if v.get("after_skip") and self._releases:  # without the flag a gap is a frame lost on the way to the log
+            skipped = max(0, release - self._releases[-1] - 1)
             self._skipped += skipped
-            self._skips_by_cause[self._last_cause] += skipped
+            self._causes[self._last_cause] += skipped
+            if not warmup:
+                self._judged_causes[self._last_cause] += skipped
         self._releases.append(release)
         self._late += late
         self._was_late = late
         self._stale_jobs += bool(v.get("stale_input"))
         self._in_warmup = warmup
         self._warmup_jobs += warmup
-        self._warmup_misses += (late + max(0, skipped)) if warmup else 0
+        self._warmup_misses += (late + skipped) if warmup else 0
         if not warmup and v.get("wake_lat_us") is not None:
             self._wake_us.append(v["wake_lat_us"])
 
@@ -232,6 +236,7 @@ class ResultAccumulator:
         self._causes[self._last_cause] += self._was_late  # a job in time may name a cause (stale input), too
         if self._in_warmup:
             return
+        self._judged_causes[self._last_cause] += self._was_late
         for key, into in (("exec_wall_us", self._exec_us), ("resp_us", self._resp_us)):
             if v.get(key) is not None:
                 into.append(v[key])
@@ -251,12 +256,12 @@ class ResultAccumulator:
         """
         accuracy = {c: self._accuracy(f"{c}_degc") for c in ("theta_w", "theta_r")}
         span_s = (self._last_ns - self._first_ns) / 1e9 if self._first_ns is not None else 0.0
-        dropped = self._lost + facts.log_dropped
+        dropped = max(self._lost, facts.log_dropped)  # the same frames, seen by their counters and by the kernel
         findings = [
             *self._judge_run(facts),
             *self._judge_accuracy(accuracy, facts.limits),
-            *self._judge_timing(facts),
-            self._judge_log(dropped),
+            *self._judge_timing(facts, dropped),
+            self._judge_log(dropped, facts.log_cut_short),
         ]
         jobs = len(self._releases)
         return {
@@ -277,7 +282,7 @@ class ResultAccumulator:
                     "miss_skipped": self._skipped,
                     "stale_jobs": self._stale_jobs,
                     "causes": {
-                        k: n + self._skips_by_cause[k] for k, n in self._causes.items() if n + self._skips_by_cause[k]
+                        k: n for k, n in self._causes.items() if n
                     },
                     "wake_lat_us": _quantiles(self._wake_us),
                     "exec_wall_us": _quantiles(self._exec_us),
@@ -327,48 +332,39 @@ class ResultAccumulator:
                 )
         return out
 
-    def _judge_timing(self, facts: RunFacts) -> list[Finding]:
+    def _judge_timing(self, facts: RunFacts, dropped: int) -> list[Finding]:
         jobs = len(self._releases)
         out = []
         if not facts.lockstep:
             misses = self._late + self._skipped - self._warmup_misses
-            by_machine = min(misses, sum(self._causes[c] + self._skips_by_cause[c] for c in MACHINE_CAUSES))
-            releases = jobs + self._skipped - self._warmup_jobs
-            out.append(judge_misses(min(misses, releases), by_machine, max(releases, 0), facts.limits.miss_rate_max))
-        counted = self._last.get("EstReleases", {})
-        if counted.get("releases") is not None and jobs:
-            own_jobs, own_releases = self._count("EstReleases", "jobs"), self._count("EstReleases", "releases")
-            own_skipped = self._count("EstMisses", "miss_skipped")
-            # The counters were sent once a second; jobs logged since then are the difference, never a deficit.
-            if own_releases != own_jobs + own_skipped:
-                out.append(
-                    Finding(
-                        "conservation",
-                        "fail",
-                        f"estimator counted {own_releases} releases, but {own_jobs} jobs + {own_skipped} skipped",
-                    )
-                )
-            elif jobs < own_jobs:
-                out.append(
-                    Finding(
-                        "conservation",
-                        "inconclusive",
-                        f"estimator executed {own_jobs} jobs, only {jobs} of them are in the log",
-                    )
-                )
-            else:
-                out.append(
-                    Finding(
-                        "conservation", "pass", f"{own_releases} releases = {own_jobs} jobs + {own_skipped} skipped"
-                    )
-                )
+            by_machine = min(misses, sum(self._judged_causes[c] for c in MACHINE_CAUSES))
+            releases = max(jobs + self._skipped - self._warmup_jobs, 0)
+            finding = judge_misses(min(misses, releases), by_machine, releases, facts.limits.miss_rate_max)
+            if finding.verdict == "fail" and dropped:
+                finding = replace(finding, verdict="inconclusive", evidence=f"{finding.evidence}; but the log has gaps")
+            out.append(finding)
+        own_releases, own_jobs = self._count("EstReleases", "releases"), self._count("EstReleases", "jobs")
+        own_skipped = self._count("EstMisses", "miss_skipped")
+        if not own_releases or own_releases >= RELEASES_LAST or own_skipped >= SKIPPED_LAST:
+            return out  # nothing was counted yet, or a counter stands at its last code: no account to compare
+        # The counters were sent once a second; jobs logged since then are the difference, never a deficit.
+        if own_releases != own_jobs + own_skipped:
+            says = f"estimator counted {own_releases} releases, but {own_jobs} jobs + {own_skipped} skipped"
+            out.append(Finding("conservation", "fail", says))
+        elif jobs < own_jobs:
+            says = f"estimator executed {own_jobs} jobs, only {jobs} of them are in the log"
+            out.append(Finding("conservation", "inconclusive", says))
+        else:
+            says = f"{own_releases} releases = {own_jobs} jobs + {own_skipped} skipped"
+            out.append(Finding("conservation", "pass", says))
         return out
 
-    def _judge_log(self, dropped: int) -> Finding:
-        if dropped or self._damaged:
-            return Finding(
-                "log", "inconclusive", f"{dropped} frames missing, {self._damaged} damaged: figures may be wrong"
-            )
+    def _judge_log(self, dropped: int, cut_short: bool) -> Finding:
+        trouble = [f"{dropped} frames missing"] if dropped else []
+        trouble += [f"{self._damaged} damaged"] if self._damaged else []
+        trouble += ["the logger could not take all that had arrived"] if cut_short else []
+        if trouble:
+            return Finding("log", "inconclusive", f"{', '.join(trouble)}: figures may be wrong")
         return Finding("log", "pass", f"{self._frames} frames, none missing by their counters")
 
 

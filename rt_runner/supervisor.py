@@ -2,6 +2,7 @@
 
 import json
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -11,10 +12,11 @@ from rt_runner import machine, paths
 from rt_runner.bus import BusChoice, HubProcess
 from rt_runner.children import Child, ChildError
 from rt_runner.config import Scenario
-from rt_runner.dbc import Dbc, load_dbc
 from rt_runner.errors import RtError, SetupError
+from rt_runner.provenance import Provenance
 from rt_runner.result import RunFacts
 
+LOGGER_READY_S = 30.0
 READY_S = 90.0  # the plant compiles its kernel at first use and drives to the scenario's start
 ESTIMATOR_DRAIN_S = 0.25
 
@@ -26,6 +28,7 @@ class Plan:
     scenario: Scenario
     bus: BusChoice
     log: Path
+    provenance: Provenance
     seed: int = 1
     core: int | None = None
     realtime: bool = True
@@ -43,7 +46,6 @@ class Supervisor:
 
     def __init__(self, plan: Plan, say: Callable[[str], None], progress: Callable[[dict], None]) -> None:
         self._plan, self._say, self._progress = plan, say, progress
-        self._dbc = load_dbc()
         self._core, self._others = machine.split_cores(plan.core)
         self._stopped = False
         self._children: list[Child] = []
@@ -65,9 +67,9 @@ class Supervisor:
         RtError
             Set-up failed, or the logger itself was lost: there is no result then.
         """
-        with HubProcess.serving(self._plan.bus, self._say) as bus:
-            logger = self._start_logger(bus)
+        with HubProcess.serving(self._plan.bus, self._say, self._others) as bus:
             try:
+                logger = self._start_logger(bus)
                 if bus.startswith("rt_hub:"):
                     self._say(f"attach to it: cantools monitor dbc/drive.dbc -i rt_hub -c {bus.partition(':')[2]}")
                 return self._run_on(bus, logger)
@@ -81,77 +83,43 @@ class Supervisor:
         return child
 
     def _start_logger(self, bus: str) -> Child:
-        config = self._plan.log.with_suffix(".config.json")
-        config.write_text(json.dumps(self._log_config()))
+        """Started first, and waited for even if the run is stopped meanwhile: an interrupted run has a log, too."""
         try:
-            logger = self._start(
-                "logger",
-                [
-                    sys.executable,
-                    "-m",
-                    "rt_runner.logger",
-                    "--bus",
-                    bus,
-                    "--log",
-                    str(self._plan.log),
-                    "--config",
-                    str(config),
-                ],
-                self._others,
-            )
-            logger.wait_line("ready", 30.0, lambda: self._stopped)
-        finally:
-            config.unlink(missing_ok=True)
+            with tempfile.NamedTemporaryFile("w", prefix="rt-logger-", suffix=".json") as config:
+                json.dump({**vars(self._plan.provenance), "facts": asdict(self._facts())}, config)
+                config.flush()
+                command = ["rt_runner.logger", "--bus", bus, "--log", str(self._plan.log), "--config", config.name]
+                logger = self._start("logger", [sys.executable, "-m", *command], self._others)
+                logger.wait_line("ready", LOGGER_READY_S)
+        except OSError as e:
+            raise SetupError(f"cannot write the logger's configuration to {tempfile.gettempdir()}: {e.strerror}") from e
         return logger
 
-    def _log_config(self) -> dict:
-        plan = self._plan
-        return log_config(plan.scenario, plan.bus.name, plan.seed)
-
-    def _run_on(self, bus: str, logger: Child) -> dict:
+    def _facts(self) -> RunFacts:
         plan, scenario = self._plan, self._plan.scenario
-        facts = RunFacts(
+        return RunFacts(
             bus=plan.bus.name,
             scenario=scenario.name,
             period_s=scenario.estimator.period_s,
             seed=plan.seed,
             limits=scenario.limits,
         )
-        crash, began, steal_0 = None, time.monotonic(), machine.steal_ms(self._core)
+
+    def _plant_command(self, bus: str) -> list[str]:
+        plan, scenario = self._plan, self._plan.scenario
+        command = ["plant_sim", "--scenario", str(scenario.path), "--bus", bus, "--seed", str(plan.seed)]
+        if scenario.duration_s:
+            command += ["--duration", str(scenario.duration_s)]
+        return [sys.executable, "-m", *command]
+
+    def _run_on(self, bus: str, logger: Child) -> dict:
+        facts, crash = self._facts(), None
+        began, steal_0 = time.monotonic(), machine.steal_ms(self._core)
         try:
-            plant = self._start(
-                "plant",
-                [
-                    sys.executable,
-                    "-m",
-                    "plant_sim",
-                    "--scenario",
-                    str(scenario.path),
-                    "--bus",
-                    bus,
-                    "--seed",
-                    str(plan.seed),
-                    "--duration",
-                    str(scenario.duration_s),
-                ]
-                if scenario.duration_s
-                else [
-                    sys.executable,
-                    "-m",
-                    "plant_sim",
-                    "--scenario",
-                    str(scenario.path),
-                    "--bus",
-                    bus,
-                    "--seed",
-                    str(plan.seed),
-                ],
-                self._others,
-            )
+            plant = self._start("plant", self._plant_command(bus), self._others)
             plant.wait_line("ready", READY_S, lambda: self._stopped)
             estimator = self._start("estimator", self._estimator_command(bus), None)
             granted = estimator.wait_line("ready", 10.0, lambda: self._stopped)
-            check_same_dbc(granted, self._dbc)
             facts = replace(facts, granted=granted)
             for warning in granted.get("warnings", []):
                 self._say(f"warning: estimator: {warning}")
@@ -160,8 +128,8 @@ class Supervisor:
             self._watch(plant, estimator, logger)
             if not self._stopped:
                 time.sleep(ESTIMATOR_DRAIN_S)  # the last interval is estimated, too
-            self._end("plant", plant)
-            self._end("estimator", estimator)
+            self._end(estimator)  # first: a job after the last frame would only find stale inputs
+            self._end(plant)
         except ChildError as e:
             if not self._stopped:
                 crash = str(e)
@@ -224,7 +192,7 @@ class Supervisor:
             elif "error" in line:
                 raise ChildError(f"the logger: {line['error']}")
 
-    def _end(self, name: str, child: Child) -> None:
+    def _end(self, child: Child) -> None:
         status = child.stop()
         if status not in (0, -15):
             raise ChildError(child.obituary())
@@ -239,33 +207,3 @@ class Supervisor:
         logger.reap(10.0)
         return result
 
-
-def check_same_dbc(granted: dict, dbc: Dbc) -> None:
-    """Refuse an estimator that was generated from another DBC than the one everybody else reads.
-
-    Raises
-    ------
-    SetupError
-        Its frames would be misread.
-    """
-    built = str(granted.get("dbc_hash", "")).lower().removeprefix("0x")
-    if not dbc.sha256.startswith(built) or not built:
-        raise SetupError(
-            f"the estimator was built from another DBC ({built or 'unknown'}) than {dbc.path} ({dbc.sha256[:6]}): "
-            "run 'make build'"
-        )
-
-
-def log_config(scenario: Scenario, bus: str, seed: int) -> dict:
-    """What a log carries beside its frames: metadata ``run`` and the attachments that make the run repeatable."""
-    run = {
-        "scenario": scenario.name,
-        "title": scenario.title,
-        "bus": bus,
-        "seed": str(seed),
-        "setting": scenario.estimator.setting,
-        "period_s": repr(scenario.estimator.period_s),
-        "scenario_sha256": scenario.sha256,
-        **machine.describe(),
-    }
-    return {"run": run, "attachments": {"scenario.toml": str(scenario.path)}}

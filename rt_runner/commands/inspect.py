@@ -14,7 +14,10 @@ def add_parser(subparsers) -> None:
 
 
 def run(args) -> int:
-    """Print it; returns 0 whatever the log's verdict is, 1 if the log is unfinished, damaged or no log at all."""
+    """Print it; returns 0 whatever the log's verdict is.
+
+    1 if the log is unfinished, damaged, no log, or carries a result that its own frames do not give.
+    """
     import sys
 
     from rt_runner.inspect import as_json, show
@@ -25,7 +28,10 @@ def run(args) -> int:
     write_json(as_json(summary), args.json)
     if args.json != "-":
         show(summary)
-    if not summary.trouble:
+    trouble = list(summary.trouble)
+    if summary.differences:
+        trouble.append(f"its result is not what its frames give ({', '.join(summary.differences)}): do not trust it")
+    if not trouble:
         return 0
-    print(f"rt-runner: {args.log}: {'; '.join(summary.trouble)}", file=sys.stderr)
+    print(f"rt-runner: {args.log}: {'; '.join(trouble)}", file=sys.stderr)
     return 1

@@ -3,8 +3,11 @@
 
 def add_parser(verbs) -> None:
     """Add the verb."""
-    p = verbs.add_parser("report", help="a log as one HTML page: temperatures, errors, timing, frames",
-                         description="Draw a log as one HTML file that needs no network: figures, charts, tables.")
+    p = verbs.add_parser(
+        "report",
+        help="a log as one HTML page: temperatures, errors, timing, frames",
+        description="Draw a log as one HTML file that needs no network: figures, charts, tables.",
+    )
     p.add_argument("log", metavar="LOG", help="an .mcap file, finished or not")
     p.add_argument("-o", "--out", metavar="OUT.html", help="default: beside the log")
     p.add_argument("--json", metavar="FILE", help="write the page's figures as JSON (- for standard output)")

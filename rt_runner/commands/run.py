@@ -10,7 +10,7 @@ def add_parser(verbs) -> None:
         help="plant and estimator over CAN, in real time",
         description="Run plant, estimator and logger on a CAN bus in real time, then judge the log.",
     )
-    add_scenario_options(p)
+    add_scenario_options(p, "hot-lap")
     p.add_argument(
         "--bus", default="auto", metavar="auto|vcan0|can0|hub", help="default: vcan0 if it exists, else the hub"
     )
@@ -19,10 +19,10 @@ def add_parser(verbs) -> None:
     p.set_defaults(run=run)
 
 
-def add_scenario_options(p: argparse.ArgumentParser) -> None:
+def add_scenario_options(p: argparse.ArgumentParser, default: str) -> None:
     """Options that ``run`` and ``mil`` share."""
     p.add_argument(
-        "scenario", nargs="?", default="hot-lap", metavar="SCENARIO", help="name or .toml file (default: hot-lap)"
+        "scenario", nargs="?", default=default, metavar="SCENARIO", help=f"name or .toml file (default: {default})"
     )
     p.add_argument("--duration", type=float, metavar="S", help="seconds, instead of the scenario's")
     p.add_argument("--setting", help="estimator setting: default or paper")
@@ -57,20 +57,32 @@ def run(args) -> int:
     import signal
     from pathlib import Path
 
-    from rt_runner import paths
+    from rt_runner import provenance
     from rt_runner.bus import choose_bus
+    from rt_runner.dbc import load_dbc
+    from rt_runner.machine import check_core
     from rt_runner.mcap_log import prepare_log_path
-    from rt_runner.present import Progress, deliver
+    from rt_runner.present import Progress, check_json_path, deliver
     from rt_runner.supervisor import Plan, Supervisor
 
     scenario = scenario_from(args)
-    paths.binary("rt_estimator")
+    check_core(args.core)
+    check_json_path(args.json, args.log)
+    identity = provenance.preflight(scenario, load_dbc())
     bus = choose_bus(args.bus)
     log = prepare_log_path(Path(args.log) if args.log else None, scenario.name)
     progress = Progress(scenario.duration_s)
     progress.line(f"{scenario.name}: {scenario.title}")
     progress.line(f"bus: {bus.name}, {bus.reason}")
-    plan = Plan(scenario=scenario, bus=bus, log=log, seed=args.seed, core=args.core, realtime=not args.no_rt)
+    plan = Plan(
+        scenario=scenario,
+        bus=bus,
+        log=log,
+        provenance=provenance.gather(scenario, bus.name, args.seed, identity),
+        seed=args.seed,
+        core=args.core,
+        realtime=not args.no_rt,
+    )
     supervisor = Supervisor(plan, progress.line, progress.update)
     before = {s: signal.signal(s, lambda *_: supervisor.stop()) for s in (signal.SIGINT, signal.SIGTERM)}
     try:

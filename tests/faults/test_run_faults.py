@@ -5,7 +5,9 @@ import json
 import os
 import signal
 import socket
+import stat
 import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -109,7 +111,7 @@ def live(tmp_path):
         (("run", "no-such-scenario"), "unknown scenario 'no-such-scenario'"),
         (("mil", "no-such-scenario"), "unknown scenario 'no-such-scenario'"),
         (("run", "hot-lap", "--bus", "can7"), "bus can7: can7 does not exist"),
-        (("run", "hot-lap", "--duration", "0"), "must be positive seconds"),
+        (("run", "hot-lap", "--duration", "0"), "must be 0.01 s or more"),
         (("run", "hot-lap", "--period", "0.0001"), "must be 0.001"),
         (("run", "hot-lap", "--seed", "-1"), "must be 0 or more"),
         (("inspect", "no-such.mcap"), "no-such.mcap"),
@@ -123,6 +125,27 @@ def test_refused_in_one_line(args, says, tmp_path):
     assert not list(tmp_path.iterdir()), "something was half-written"
 
 
+def test_a_terminal_without_our_letters(tmp_path):
+    log = tmp_path / "x.mcap"
+    assert rt_runner("mil", "hot-lap", "--duration", 1, "--log", log, env={"PYTHONIOENCODING": "ascii"}).returncode == 3
+    done = rt_runner("inspect", log, env={"PYTHONIOENCODING": "ascii"})
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_result_that_its_frames_do_not_give(tmp_path):
+    log = tmp_path / "x.mcap"
+    rt_runner("mil", "hot-lap", "--duration", 12, "--log", log)
+    honest = rt_runner("inspect", log)
+    assert honest.returncode == 0, honest.stderr
+    assert "recomputed from the frames: the same result" in honest.stdout
+    raw = log.read_bytes()
+    place = raw.index(b'"est_max_degc": 0.') + len(b'"est_max_degc": 0.')
+    log.write_bytes(raw[:place] + (b"9" if raw[place : place + 1] != b"9" else b"8") + raw[place + 1 :])
+    forged = rt_runner("inspect", log)
+    assert forged.returncode == 1
+    assert "accuracy.theta_w.est_max_degc" in one_line(forged.stderr)
+
+
 @pytest.mark.parametrize("args", [("run", "--duration", "soon"), ("fly",), ()])
 def test_usage_errors_exit_with_1(args):
     done = rt_runner(*args)
@@ -130,11 +153,68 @@ def test_usage_errors_exit_with_1(args):
     assert "Traceback" not in done.stderr
 
 
-def test_unknown_setting_is_refused(tmp_path):
-    done = rt_runner("mil", "hot-lap", "--duration", 1, "--setting", "guess", "--log", tmp_path / "x.mcap")
+@pytest.mark.parametrize("verb", ["run", "mil"])
+def test_unknown_setting_is_refused(verb, tmp_path):
+    done = rt_runner(verb, "hot-lap", "--duration", 1, "--setting", "guess", "--log", tmp_path / "x.mcap")
     assert done.returncode == 1
-    assert "guess" in one_line(done.stderr.splitlines()[-1])
-    assert not (tmp_path / "x.mcap").exists()
+    assert "guess" in one_line(done.stderr)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_core_that_is_not_ours(tmp_path):
+    done = rt_runner(*RUN, "--core", 4096, "--log", tmp_path / "x.mcap")
+    assert done.returncode == 1
+    assert "--core 4096" in one_line(done.stderr)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="making a device needs root")
+def test_a_device_is_written_to_and_never_replaced(tmp_path):
+    null = tmp_path / "null"
+    os.mknod(null, 0o666 | stat.S_IFCHR, os.makedev(1, 3))
+    done = rt_runner("mil", "hot-lap", "--duration", 1, "--log", tmp_path / "x.mcap", "--json", null)
+    assert done.returncode == 3, done.stderr
+    assert stat.S_ISCHR(null.stat().st_mode)
+    done = rt_runner("mil", "hot-lap", "--duration", 1, "--log", null)
+    assert done.returncode == 1
+    assert "no ordinary file" in one_line(done.stderr)
+    assert stat.S_ISCHR(null.stat().st_mode)
+
+
+def test_a_pipe_is_no_place_for_a_log(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    done = rt_runner("mil", "hot-lap", "--duration", 1, "--log", tmp_path / "pipe", timeout_s=30)
+    assert done.returncode == 1
+    assert "no ordinary file" in one_line(done.stderr)
+
+
+@pytest.mark.parametrize("path", ["", ".", "/", "no-such-folder/x.json", "n" * 300])
+def test_json_paths_that_cannot_be(path, tmp_path):
+    done = rt_runner("mil", "hot-lap", "--duration", 1, "--log", tmp_path / "x.mcap", "--json", path)
+    assert done.returncode == 1
+    one_line(done.stderr.splitlines()[-1])
+    assert "Traceback" not in done.stderr
+
+
+def test_log_and_json_must_be_two_files(tmp_path):
+    done = rt_runner("mil", "--duration", 1, "--log", tmp_path / "x", "--json", tmp_path / "x")
+    assert done.returncode == 1
+    assert "same file" in one_line(done.stderr)
+
+
+@pytest.mark.parametrize("name", ["n" * 300, "n" * 300 + ".toml"])
+def test_names_nobody_can_have(name):
+    done = rt_runner("mil", name)
+    assert done.returncode == 1
+    one_line(done.stderr)
+
+
+def test_the_working_folder_cannot_stand_in_for_our_modules(tmp_path):
+    (tmp_path / "plant_sim.py").write_text("raise SystemExit('not the plant')")
+    done = subprocess.run(
+        [Path(sys.executable).with_name("rt-runner"), "mil", "hot-lap", "--duration", "1", "--log", "x.mcap"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 3, done.stderr  # too short to judge, but it ran
 
 
 def test_a_log_path_that_is_a_folder(tmp_path):
@@ -219,6 +299,66 @@ def test_ctrl_c_ends_cleanly(live, sig):
     assert load_result(run.json)["verdict"] == "inconclusive"
 
 
+@pytest.mark.parametrize("after_s", [0.6, 0.9, 1.2, 1.8, 3.0])
+def test_ctrl_c_at_any_time_leaves_a_readable_log_or_nothing_started(live, after_s):
+    run = live(60)
+    time.sleep(after_s)
+    run.process.send_signal(signal.SIGINT)
+    status, text = run.end()
+    assert "Traceback" not in text
+    if run.log.exists():
+        assert status == 3, text
+        assert summarise(run.log).complete
+    else:
+        assert status in (3, 130), text
+    assert not [p for p in Path("/proc").glob("[0-9]*/stat") if _parent(p) == run.process.pid]
+
+
+def _parent(stat_file: Path) -> int:
+    try:
+        return int(stat_file.read_text().rsplit(")", 1)[1].split()[1])
+    except OSError:
+        return -1
+
+
+@pytest.mark.parametrize("sig", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_lock_step_ends_cleanly_too(tmp_path, sig):
+    log = tmp_path / "x.mcap"
+    run = start_rt_runner("mil", "lap", "--log", log)
+    deadline = time.monotonic() + 60
+    while not (log.exists() and log.stat().st_size > 200_000) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    run.send_signal(sig)
+    out, err = run.communicate(timeout=60)
+    assert run.returncode == 3, out + err
+    assert "Traceback" not in err
+    assert summarise(log).complete
+    assert "stopped by hand" in out
+
+
+def test_lock_step_killed_takes_its_children_along(tmp_path):
+    run = start_rt_runner("mil", "lap", "--log", tmp_path / "x.mcap")
+    children: list[int] = []
+    deadline = time.monotonic() + 60
+    while len(children) < 2 and time.monotonic() < deadline:
+        children = [int(p.parent.name) for p in Path("/proc").glob("[0-9]*/stat") if _parent(p) == run.pid]
+        time.sleep(0.01)
+    run.kill()
+    run.communicate()
+    deadline = time.monotonic() + 10
+    while any(Path(f"/proc/{p}").exists() for p in children) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert len(children) == 2
+    assert not [p for p in children if Path(f"/proc/{p}").exists()]
+
+
+def test_a_neighbouring_file_is_left_alone(tmp_path):
+    mine = tmp_path / "x.config.json"
+    mine.write_text("mine")
+    assert rt_runner(*RUN, "--duration", 2, "--log", tmp_path / "x.mcap").returncode == 3
+    assert mine.read_text() == "mine"
+
+
 def test_a_killed_supervisor_takes_its_children_along_and_leaves_a_finished_log(live):
     run = live(60)
     run.wait_for_estimates()
@@ -289,12 +429,36 @@ def test_a_full_disk(live, tmp_path):
         subprocess.run(["umount", "-l", str(small)], check=True)
 
 
-def test_a_result_that_cannot_be_written(tmp_path):
-    done = rt_runner(
-        "mil", "hot-lap", "--duration", 1, "--log", tmp_path / "x.mcap", "--json", tmp_path / "no" / "x.json"
-    )
-    assert done.returncode == 1
-    assert "cannot write --json" in done.stderr
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounting a small tmpfs needs root")
+@pytest.mark.parametrize("verb", ["run", "mil"])
+def test_a_disk_that_is_full_from_the_start(tmp_path, verb):
+    small = tmp_path / "small"
+    small.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(small)], check=True)
+    try:
+        (small / "full").write_bytes(bytes(12_000))
+        bus = ("--bus", "hub") if verb == "run" else ()
+        done = rt_runner(verb, "hot-lap", *bus, "--duration", 3, "--log", small / "x.mcap")
+        assert done.returncode == 1
+        assert "No space left" in done.stderr
+        assert "Traceback" not in done.stderr
+    finally:
+        subprocess.run(["umount", "-l", str(small)], check=True)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounting a small tmpfs needs root")
+def test_a_disk_that_fills_up_in_lock_step(tmp_path):
+    small = tmp_path / "small"
+    small.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(small)], check=True)
+    try:
+        done = rt_runner("mil", "lap", "--log", small / "x.mcap")
+        assert done.returncode == 1
+        assert "No space left" in one_line(done.stderr.splitlines()[-1])
+        assert b"\0" * 1000 not in (small / "x.mcap").read_bytes(), "there is a hole in the log"
+        assert sum(1 for _ in read_log(small / "x.mcap")) > 1000
+    finally:
+        subprocess.run(["umount", "-l", str(small)], check=True)
 
 
 def test_json_to_standard_output_is_nothing_but_json(tmp_path):

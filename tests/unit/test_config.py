@@ -35,8 +35,11 @@ def test_a_file_of_ones_own(tmp_path):
         ("duration_s = ", "not valid TOML"),
         ("durations = 5", "unknown key 'durations'"),
         ('duration_s = "long"', "must be a number"),
-        ("duration_s = -1", "0 or more"),
-        ("duration_s = nan", "0 or more"),
+        ("duration_s = -1", "0.01 s or more"),
+        ("duration_s = nan", "0.01 s or more"),
+        ("duration_s = 0.004", "0.01 s or more"),
+        ("[cycle]\nstart_s = 1e5", "0 … 10800"),
+        ('[cycle]\nkind = "csv"\npath = "gone.csv"', "no file"),
         ("cycle = 5", "must be a table"),
         ('[cycle]\nkind = "moon"', "none of lap, class3, csv"),
         ('[cycle]\nkind = "csv"', "needs it"),
@@ -73,8 +76,8 @@ def test_duration_option():
     s = load_scenario("hot-lap")
     assert with_duration(s, None) is s
     assert with_duration(s, 12.0) == dataclasses.replace(s, duration_s=12.0)
-    for bad in (0.0, -3.0, float("inf"), float("nan")):
-        with pytest.raises(UsageError, match="must be positive"):
+    for bad in (0.0, -3.0, 0.004, float("inf"), float("nan")):
+        with pytest.raises(UsageError, match=r"must be 0\.01 s or more"):
             with_duration(s, bad)
 
 

@@ -37,7 +37,7 @@ def feed_run(acc, seconds=30, error=0.1, raw=-1.2, first_tick=40_001, skip=(), l
                 "miss_late": int(k in late),
                 "warmup": int(k < warmup),
                 "stale_input": 0,
-                "after_skip": 0,
+                "after_skip": int(k in skip),
                 "release_index": release % 2**24,
                 "wake_lat_us": 20.0 + k % 7,
             },
@@ -45,7 +45,11 @@ def feed_run(acc, seconds=30, error=0.1, raw=-1.2, first_tick=40_001, skip=(), l
         put(
             t + 3000,
             "EstTimingB",
-            {"miss_cause": cause if k in late or k + 1 in skip else 0, "exec_wall_us": 40.0, "resp_us": 70.0},
+            {
+                "miss_cause": (cause[k] if isinstance(cause, dict) else cause) if k in late or k + 1 in skip else 0,
+                "exec_wall_us": 40.0,
+                "resp_us": 70.0,
+            },
         )
     return release
 
@@ -111,6 +115,58 @@ def test_misses_during_warm_up_are_shown_but_not_judged():
     r = acc.result(facts())
     assert r["timing"]["estimator"]["miss_late"] == 40
     assert r["verdict"] == "pass"
+
+
+def test_the_machines_misses_during_warm_up_do_not_excuse_our_own_later():
+    acc = ResultAccumulator()
+    feed_run(acc, late=set(range(20)), warmup=20, cause=1)
+    more = ResultAccumulator()
+    feed_run(more, late=set(range(20, 100)), warmup=20, cause=3)
+    assert more.result(facts())["verdict"] == "fail"
+    both = ResultAccumulator()
+    feed_run(
+        both, late=set(range(100)), warmup=20, cause={**dict.fromkeys(range(20), 1), **dict.fromkeys(range(20, 100), 3)}
+    )
+    assert both.result(facts())["verdict"] == "fail"
+
+
+def test_timing_frames_lost_on_the_way_to_the_log_are_no_skipped_activations():
+    acc, counters = ResultAccumulator(), {}
+    for k in range(300):
+        for name, values in (
+            ("EstTimingA", {"release_index": k, "wake_lat_us": 5.0, "after_skip": 0, "miss_late": 0, "warmup": 0}),
+            ("EstTimingB", {"miss_cause": 0, "exec_wall_us": 40.0, "resp_us": 50.0}),
+        ):
+            counters[name] = (counters.get(name, -1) + 1) % 16
+            if k % 4:
+                acc.feed(k, name, {"counter": counters[name], **values})
+    r = acc.result(facts())
+    assert r["timing"]["estimator"]["miss_skipped"] == 0
+    assert r["log"]["dropped"] == 148  # of 75 lost pairs, the first before anything was known
+    assert r["verdict"] == "inconclusive"
+
+
+def test_frames_the_kernel_dropped_and_the_gaps_they_leave_are_the_same_frames():
+    acc = ResultAccumulator()
+    feed_run(acc)
+    acc.feed(31 * 10**9, "Reference", {"counter": 3})
+    acc.feed(31 * 10**9, "Reference", {"counter": 6})
+    assert acc.result(facts(log_dropped=2))["log"]["dropped"] == 2
+    assert acc.result(facts(log_dropped=5))["log"]["dropped"] == 5
+
+
+def test_counters_at_their_last_code_prove_nothing():
+    acc = ResultAccumulator()
+    feed_run(acc)
+    acc.feed(1, "EstReleases", {"releases": 900_000, "jobs": 800_000})
+    acc.feed(1, "EstMisses", {"miss_late": 0, "miss_skipped": 65_534, "overrun": 0})
+    assert not any(f["what"] == "conservation" for f in acc.result(facts())["findings"])
+
+
+def test_a_logger_that_could_not_take_everything_makes_it_inconclusive():
+    acc = ResultAccumulator()
+    feed_run(acc)
+    assert acc.result(facts(log_cut_short=True))["verdict"] == "inconclusive"
 
 
 def test_wrong_temperatures_fail():
