@@ -4,7 +4,7 @@
 #include <string.h>
 
 #define RING_MASK (ESTIMATOR_RING - 1)
-#define OFF_GRID_LIMIT 10 /* that many temperature frames off the grid in a row mean the plant moved its grid */
+#define OFF_GRID_LIMIT 3 /* that many temperature frames off the grid in a row mean the plant moved its grid */
 
 /* A channel that gives nothing for so many intervals after the first node must not keep back the other's estimate. */
 #define START_WAIT 20

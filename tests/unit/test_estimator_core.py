@@ -358,6 +358,16 @@ def test_frames_off_the_grid_are_counted_and_a_moved_grid_restarts() -> None:
     assert est.step().status == RUNNING
 
 
+def test_a_plant_restarted_just_before_the_wrap_is_noticed_by_its_grid() -> None:
+    """Tick 65502, then 0: to the motor frames that is a gap of 0.34 s; three temperature frames later it is known."""
+    est = estimator()
+    run(est, 64_000, 65_502)
+    outs = run(est, 0, 300)
+    assert (est.counters.restarts, est.counters.off_grid) == (1, 3)
+    assert [o.status for o in outs[3:5]] == [STARTING] * 2
+    assert outs[-1].status == RUNNING
+
+
 def test_repeated_motor_tick_counts_once() -> None:
     est = estimator()
     run(est, 0, 3000)
