@@ -1,6 +1,6 @@
 /* Random frames into the estimator's core: for the sanitizers, and for what must hold whatever arrives.
  *
- *   test_estimator_fuzz [ROUNDS] [SEED]    exit 0: everything held; 1: one line says what did not */
+ *   test_estimator_fuzz [ROUNDS] [SEED]    exit 0: everything held, and every status was seen; 1: one line says what not */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -8,6 +8,7 @@
 #include "estimator.h"
 
 static uint64_t state;
+static uint32_t seen[ESTIMATOR_INVALID + 1]; /* outputs by status */
 
 /* xorshift64*: reproducible everywhere */
 static uint64_t draw(void)
@@ -55,6 +56,7 @@ static uint32_t next_tick(uint32_t tick)
 
 static int play(estimator_t *self, uint32_t round, uint32_t frames)
 {
+    const bool dead_w = below(8) == 0, dead_r = below(8) == 0; /* a sensor that never was there */
     uint32_t tick = below(200000);
     for (uint32_t k = 0; k < frames; k++) {
         tick = next_tick(tick);
@@ -63,14 +65,18 @@ static int play(estimator_t *self, uint32_t round, uint32_t frames)
         }
         if (tick % 10 == 0 || below(200) == 0) {
             const uint32_t late = below(20) == 0 ? 10 * below(30) : 0;
-            estimator_feed_temp(self, (uint16_t)(tick - late), value(-60, 220), value(-60, 220), below(30) != 0,
-                                below(30) != 0);
+            estimator_feed_temp(self, (uint16_t)(tick - late), value(-60, 220), value(-60, 220),
+                                !dead_w && below(30) != 0, !dead_r && below(30) != 0);
         }
         if (below(12) != 0) {
             continue;
         }
         estimator_out_t out;
         estimator_step(self, &out);
+        if (out.status > ESTIMATOR_INVALID) {
+            return fail("a status that does not exist", round);
+        }
+        seen[out.status]++;
         const bool numbers = isfinite(out.theta_w_degc) && isfinite(out.theta_r_degc);
         const bool valid = out.status == ESTIMATOR_RUNNING || out.status == ESTIMATOR_PREDICTING ||
                            out.status == ESTIMATOR_INPUT_STALE;
@@ -104,12 +110,21 @@ int main(int argc, char **argv)
             setting.delay_steps = (int32_t)below(40);
             setting.spin_up_steps = (int32_t)below(20);
         }
+        if (below(10) == 0) {
+            setting.weight_noise[below(2)] = (double)NAN; /* no solution is finite: the way to status invalid */
+        }
         if (estimator_init(&self, &setting) != ESTIMATOR_OK) {
             return fail("estimator_init refused a setting", round);
         }
         const int rc = play(&self, round, 500 + below(3000));
         if (rc != 0) {
             return rc;
+        }
+    }
+    for (uint32_t status = 0; rounds >= 50 && status <= ESTIMATOR_INVALID; status++) {
+        if (seen[status] == 0) {
+            fprintf(stderr, "test_estimator_fuzz: status %u was never seen\n", status);
+            return 1;
         }
     }
     return 0;
