@@ -33,6 +33,18 @@ bool can_port_valid(const struct canfd_frame *frame, size_t size)
 
 /* ---- open: the only place where the two kinds of bus differ ------------------------------------------------ */
 
+/* Before anything can arrive: a frame that was queued earlier would be stamped only when it is read. On AF_UNIX the stamp
+ * is the moment the hub put the frame into our queue. */
+static bool ask_for_stamps(can_port_t *port, const char *bus)
+{
+  const int on = 1;
+  if (setsockopt(port->fd, SOL_SOCKET, SO_TIMESTAMPNS, &on, sizeof on) != 0) {
+    explain(port, bus, strerror(errno), "the kernel gives no receive stamps");
+    return false;
+  }
+  return true;
+}
+
 static can_port_status_t open_socketcan(can_port_t *port, const char *bus, const char *iface)
 {
   const int on = 1, size = RCVBUF_BYTES;
@@ -53,6 +65,9 @@ static can_port_status_t open_socketcan(can_port_t *port, const char *bus, const
   addr.can_ifindex = (int)if_nametoindex(iface);
   if (addr.can_ifindex == 0) {
     explain(port, bus, strerror(errno), "create it with `rt-runner vcan up`, or use --bus hub");
+    return CAN_PORT_GONE;
+  }
+  if (!ask_for_stamps(port, bus)) {
     return CAN_PORT_GONE;
   }
   if (setsockopt(port->fd, SOL_SOCKET, SO_RCVBUFFORCE, &size, sizeof size) != 0) {
@@ -84,6 +99,9 @@ static can_port_status_t open_hub(can_port_t *port, const char *bus, const char 
     explain(port, bus, strerror(errno), "cannot make a socket");
     return CAN_PORT_GONE;
   }
+  if (!ask_for_stamps(port, bus)) {
+    return CAN_PORT_GONE;
+  }
   (void)setsockopt(port->fd, SOL_SOCKET, SO_SNDTIMEO, &limit, sizeof limit);
   if (connect(port->fd, (const struct sockaddr *)&addr, sizeof addr) != 0) {
     explain(port, bus, errno == EAGAIN ? "the hub does not answer" : strerror(errno),
@@ -96,7 +114,6 @@ static can_port_status_t open_hub(can_port_t *port, const char *bus, const char 
 can_port_status_t can_port_open(can_port_t *port, const char *bus)
 {
   static const char socketcan[] = "socketcan:", hub[] = "rt_hub:";
-  const int on = 1;
   can_port_status_t status;
 
   memset(port, 0, sizeof *port);
@@ -109,11 +126,6 @@ can_port_status_t can_port_open(can_port_t *port, const char *bus)
   } else {
     explain(port, bus, "not a bus", "give socketcan:IFACE or rt_hub:PATH");
     return CAN_PORT_REFUSED;
-  }
-  /* AF_UNIX stamps too: the moment the hub put the frame into our queue. */
-  if (status == CAN_PORT_OK && setsockopt(port->fd, SOL_SOCKET, SO_TIMESTAMPNS, &on, sizeof on) != 0) {
-    explain(port, bus, strerror(errno), "the kernel gives no receive stamps");
-    status = CAN_PORT_GONE;
   }
   if (status != CAN_PORT_OK) {
     can_port_close(port);

@@ -3,7 +3,9 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/socket.h>
+#include <sys/syscall.h>
 #include <sys/un.h>
+#include <time.h>
 #include <unistd.h>
 
 #include "can_port.h"
@@ -35,6 +37,40 @@ static void put(int hub, canid_t id)
 {
   const struct can_frame f = {.can_id = id, .can_dlc = 2, .data = {1, 2}};
   CHECK(send(hub, &f, sizeof f, 0) == sizeof f);
+}
+
+/* A hub so quick that it has sent before connect returns to the port. */
+static int quick_hub = -1;
+static bool hub_is_quick;
+
+int connect(int fd, const struct sockaddr *to, socklen_t length)
+{
+  const int rc = (int)syscall(SYS_connect, fd, to, length);
+  if (rc == 0 && hub_is_quick) {
+    quick_hub = accept(listener, NULL, NULL);
+    put(quick_hub, 0x31);
+  }
+  return rc;
+}
+
+static int64_t wall_ns(void)
+{
+  struct timespec t;
+  (void)clock_gettime(CLOCK_REALTIME, &t);
+  return (int64_t)t.tv_sec * 1000000000 + t.tv_nsec;
+}
+
+static void the_very_first_frame_is_stamped_when_it_came(void)
+{
+  hub_is_quick = true;
+  CHECK(can_port_open(&port, bus) == CAN_PORT_OK);
+  hub_is_quick = false;
+  const int64_t opened_ns = wall_ns();
+  CHECK(nanosleep(&(struct timespec){.tv_nsec = 50000000}, NULL) == 0);
+  CHECK(can_port_recv(&port, &frame, &stamp_ns) == CAN_PORT_OK && frame.can_id == 0x31);
+  CHECK(stamp_ns <= opened_ns);
+  can_port_close(&port);
+  CHECK(close(quick_hub) == 0);
 }
 
 static void garbage_is_skipped_but_not_without_bound(void)
@@ -171,6 +207,7 @@ int main(int argc, char **argv)
   (void)snprintf(bus, sizeof bus, "rt_hub:%s", argv[1]);
   listener = socket(AF_UNIX, SOCK_SEQPACKET, 0);
   CHECK(bind(listener, (const struct sockaddr *)&addr, sizeof addr) == 0 && listen(listener, 4) == 0);
+  the_very_first_frame_is_stamped_when_it_came();
   garbage_is_skipped_but_not_without_bound();
   error_frames_are_counted_and_skipped();
   filters_select_by_id_mask_and_inversion();
