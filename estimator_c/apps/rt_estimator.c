@@ -52,6 +52,15 @@ __attribute__((format(printf, 1, 2))) static int fail(const char *format, ...) {
     return EXIT_FAILURE;
 }
 
+/* False when what was just written did not get out; stderr then says so. */
+static bool was_written(const char *what) {
+    if (ferror(stdout) == 0) {
+        return true;
+    }
+    (void)fail("stdout: cannot write the %s line (%s); give it a place to go", what, strerror(errno));
+    return false;
+}
+
 static void usage(FILE *out) {
     (void)fputs("usage: rt_estimator --bus socketcan:IFACE|rt_hub:PATH [--setting NAME] [--period-us 1000..1000000]\n"
                 "                    [--core N] [--priority 1..99] [--no-rt]\n"
@@ -124,7 +133,8 @@ static int parse(int argc, char **argv, options *opt) {
             break;
         case 'h':
             usage(stdout);
-            return EXIT_SUCCESS;
+            (void)fflush(stdout);
+            return was_written("usage") ? EXIT_SUCCESS : EXIT_FAILURE;
         default:
             return fail("%s: unknown option or missing value; see rt_estimator --help", argv[optind - 1]);
         }
@@ -212,6 +222,10 @@ static int run_on_bus(const options *opt) {
         return fail("setting '%s' does not fit this build; change estimator_c/settings and build again", opt->setting->name);
     }
     report_ready(stdout, opt, &granted);
+    if (!was_written("ready")) {
+        can_port_close(&port);
+        return EXIT_FAILURE;
+    }
     rt_environment_read(&run.start, true);
     est_cycle_start_grid(&cycle);
 
@@ -232,7 +246,9 @@ static int run_on_bus(const options *opt) {
         run.stopped_by = "bus";
     }
     est_report_final(stdout, &cycle, &run, &scratch);
-    const int exit_status = status == EST_CYCLE_GONE ? fail("%s", port.error) : EXIT_SUCCESS;
+    const int exit_status = status == EST_CYCLE_GONE ? fail("%s", port.error)
+                            : was_written("final")   ? EXIT_SUCCESS
+                                                     : EXIT_FAILURE;
     can_port_close(&port);
     return exit_status;
 }
@@ -314,6 +330,9 @@ static int run_lockstep(const options *opt) {
         (void)rt_record_flush(&lockstep.writer); /* what was published before the mistake; the exit status tells of that */
     }
     est_report_final(stderr, &cycle, &run, &scratch);
+    if (ferror(stderr) != 0) {
+        return EXIT_FAILURE; /* and no place to say so */
+    }
     return exit_status == -1 ? EXIT_SUCCESS : exit_status;
 }
 

@@ -40,6 +40,13 @@ static int fail(const char *format, ...)
   return -1;
 }
 
+/* 0, or -1 with one line when what was just written did not get out. */
+static int written(const char *what)
+{
+  (void)fflush(stdout);
+  return ferror(stdout) == 0 ? 0 : fail("stdout: cannot write the %s line (%s); give it a place to go", what, strerror(errno));
+}
+
 /* ---- command line ------------------------------------------------------------------------------------------ */
 
 typedef struct {
@@ -239,14 +246,14 @@ static void say_stalled(const hub_client_t *c, void *context)
   }
 }
 
-static void say_final(const hub_counters_t *c)
+static int say_final(const hub_counters_t *c)
 {
   (void)printf("{\"final\":true,\"frames\":%llu,\"delivered\":%llu,\"rejected\":%llu,\"clients\":%llu,\"refused\":%llu,"
                "\"stalled\":%llu,\"blocked_ms\":%.3f}\n",
                (unsigned long long)c->frames, (unsigned long long)c->delivered, (unsigned long long)c->rejected,
                (unsigned long long)c->clients, (unsigned long long)c->refused, (unsigned long long)c->stalled,
                (double)c->blocked_ns * 1e-6);
-  (void)fflush(stdout);
+  return written("final");
 }
 
 static int64_t now_ns(void)
@@ -293,7 +300,7 @@ int main(int argc, char **argv)
   }
   if (options.help) {
     (void)fputs(usage, stdout);
-    return 0;
+    return written("usage") == 0 ? 0 : 1;
   }
   (void)sigemptyset(&stop);
   (void)sigaddset(&stop, SIGTERM);
@@ -318,13 +325,15 @@ int main(int argc, char **argv)
   (void)fputs("{\"ready\":true,\"socket\":", stdout);
   put_json_string(options.addr.sun_path);
   (void)printf(",\"stall_s\":%g,\"clients_max\":%d,\"pid\":%d}\n", options.stall_s, (int)HUB_CLIENTS_MAX, (int)getpid());
-  (void)fflush(stdout);
+  if (written("ready") != 0) {
+    remove_own_socket(options.addr.sun_path, &identity);
+    return 1;
+  }
 
   serve(&hub, listener, signals, &options.stall_s);
 
   hub_close(&hub);
   remove_own_socket(options.addr.sun_path, &identity);
   (void)close(listener);
-  say_final(&hub.counters);
-  return 0;
+  return say_final(&hub.counters) == 0 ? 0 : 1;
 }

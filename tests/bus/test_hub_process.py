@@ -244,6 +244,17 @@ def test_set_up_errors_are_one_line(tmp_path, hub):
     assert "--mode 999" in set_up_error("--socket", tmp_path / "b", "--mode", "999")
 
 
+@pytest.mark.parametrize("arguments", [["--help"], ["--socket", "hub.sock"]])
+def test_a_stdout_that_takes_nothing_is_one_line_and_exit_1(tmp_path, arguments):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([build("estimator_c/apps/rt_hub.c"), *arguments], cwd=tmp_path, stdout=full,
+                              stderr=subprocess.PIPE, text=True, timeout=30)  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.startswith("rt_hub: stdout: cannot write the ")
+    assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
 def test_two_hubs_started_at_once_do_not_take_each_others_socket(tmp_path):
     for i in range(5):
         path = tmp_path / f"bus{i}"

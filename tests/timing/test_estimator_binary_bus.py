@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -217,6 +218,34 @@ def test_no_heap_and_no_page_fault_in_the_loop(hub, tmp_path):
         assert run.final["faults"] == {"minor": 0, "major": 0}
     else:
         print("memory is not locked here: page faults not judged", file=sys.stderr)
+
+
+def test_a_ready_line_that_nobody_gets_is_one_line_and_exit_1(hub):
+    with open("/dev/full", "w") as full:
+        for args in (["--help"], ["--bus", hub.bus, "--no-rt"]):
+            done = subprocess.run([binary("release"), *args], stdout=full, stderr=subprocess.PIPE, text=True, timeout=10,
+                                  check=False)  # fmt: skip
+            assert done.returncode == 1
+            assert done.stderr.startswith("rt_estimator: stdout: cannot write the ")
+            assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_final_line_that_nobody_gets_is_one_line_and_exit_1(hub, tmp_path):
+    """The file may grow to the ready line and no further."""
+    limit = 'ulimit -f 1; trap "" XFSZ; exec "$@"'
+    with (tmp_path / "out").open("w") as out:
+        out.write("x" * 200)  # bash counts in units of 1024 bytes: the ready line fits, the final one does not
+        out.flush()
+        process = subprocess.Popen(["bash", "-c", limit, "-", binary("release"), "--bus", hub.bus, "--no-rt"],
+                                   stdout=out, stderr=subprocess.PIPE, text=True)  # fmt: skip
+        while "ready" not in (tmp_path / "out").read_text():
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.02)
+        process.terminate()
+        _, err = process.communicate(timeout=20)
+    assert process.returncode == 1
+    assert err.startswith("rt_estimator: stdout: cannot write the final line")
+    assert len(err.splitlines()) == 1
 
 
 def test_a_set_up_that_needs_the_bus_says_so_and_leaves_nothing(tmp_path):
