@@ -57,6 +57,15 @@ static void run(int64_t now_ns)
   }
 }
 
+/* The hub looks every 50 ms; the last time at `to_ns`. */
+static void run_through(int64_t from_ns, int64_t to_ns)
+{
+  for (int64_t t = from_ns; t < to_ns; t += SECOND / 20) {
+    run(t);
+  }
+  run(to_ns);
+}
+
 static bool put(int fd, uint32_t id)
 {
   const struct can_frame f = {.can_id = id, .can_dlc = 1, .data = {7}};
@@ -174,7 +183,7 @@ static void who_does_not_read_is_disconnected_by_name(void)
     }
   }
   CHECK(put(a, 0x7ab));
-  run(2 * (int64_t)SECOND - 1);
+  run_through(0, 2 * (int64_t)SECOND - 1);
   CHECK(stalls == 0 && hub.blocked);
   run(2 * (int64_t)SECOND);
   CHECK(stalls == 1 && stalled_pid == 42 && hub.counters.stalled == 1 && hub_clients(&hub) == 2 && !hub.blocked);
@@ -191,6 +200,81 @@ static void who_does_not_read_is_disconnected_by_name(void)
   CHECK(id == -2 && kept == sent - 1); /* what was queued for it stays readable, then the end */
   hub_close(&hub);
   CHECK(close(a) == 0 && close(stuck) == 0 && close(reader) == 0);
+}
+
+static void time_the_hub_was_stopped_is_not_held_against_a_reader(void)
+{
+  hub_init(&hub, SECOND);
+  stalls = 0;
+  const int a = join(1), slow = join(42);
+  for (uint32_t sent = 0; !hub.blocked; sent++) {
+    CHECK(put(a, sent & 0x7ff));
+    run(0);
+  }
+  run(SECOND / 20);
+  run(3600 * (int64_t)SECOND); /* stopped for an hour: the reader had no chance to be served */
+  CHECK(stalls == 0 && hub.blocked);
+  const int64_t resumed = 3600 * (int64_t)SECOND;
+  run_through(resumed, resumed + SECOND * (int64_t)8 / 10);
+  CHECK(stalls == 0 && hub.blocked);
+  run_through(resumed + SECOND * (int64_t)8 / 10, resumed + SECOND);
+  CHECK(stalls == 1 && !hub.blocked && hub_clients(&hub) == 1); /* but from then on it has its second, and no more */
+  hub_close(&hub);
+  CHECK(close(a) == 0 && close(slow) == 0);
+}
+
+static void who_floods_does_not_keep_a_quiet_sender_waiting(void)
+{
+  hub_init(&hub, SECOND);
+  const int flood[] = {join(1), join(2)}, quiet = join(3), reader = join(4);
+  for (uint32_t i = 0; i < 8 * HUB_BATCH; i++) {
+    CHECK(put(flood[0], 0x100) && put(flood[1], 0x101));
+  }
+  CHECK(put(quiet, 0x7));
+  run(0);
+  int before = 0;
+  for (int64_t id; (id = get(reader)) != 0x7; before++) {
+    CHECK(id == 0x100 || id == 0x101);
+  }
+  CHECK(before <= 2 * HUB_BATCH); /* one batch of each, then it is his turn */
+  CHECK(put(quiet, 0x8)); /* and the floods are served alike: nobody is ahead by more than a batch */
+  int ahead = 0;
+  for (int64_t id; (id = get(reader)) >= 0;) {
+    ahead += id == 0x100 ? 1 : id == 0x101 ? -1 : 0;
+    CHECK(ahead >= -HUB_BATCH && ahead <= HUB_BATCH);
+  }
+  run(0);
+  CHECK(get(reader) == 0x8 && hub.counters.frames == 16 * HUB_BATCH + 2);
+  hub_close(&hub);
+  CHECK(close(flood[0]) == 0 && close(flood[1]) == 0 && close(quiet) == 0 && close(reader) == 0);
+}
+
+/* Who comes while a batch is stuck gets none of it, but everything after, and does not hold up anybody. */
+static void who_connects_while_the_bus_waits_gets_what_comes_after(void)
+{
+  hub_init(&hub, SECOND);
+  const int a = join(1), slow = join(2);
+  uint32_t sent = 0, got = 0;
+  for (; !hub.blocked; sent++) {
+    CHECK(put(a, 0x100));
+    run(0);
+  }
+  const int late = join(3);
+  CHECK(put(a, 0x200) && put(late, 0x300));
+  run(0);
+  CHECK(hub.blocked && get(late) == -1 && get(a) == -1);
+  int64_t id;
+  do {
+    while ((id = get(slow)) == 0x100) {
+      got++;
+    }
+    run(0);
+  } while (hub.blocked || id == -1);
+  CHECK(got == sent);
+  CHECK(get(late) == 0x200 && get(late) == -1);
+  CHECK(get(a) == 0x300 && get(a) == -1);
+  hub_close(&hub);
+  CHECK(close(a) == 0 && close(slow) == 0 && close(late) == 0);
 }
 
 static void garbage_is_counted_and_harms_nobody(void)
@@ -286,6 +370,9 @@ int main(void)
   a_full_reader_holds_everybody_back_and_nothing_is_lost();
   nobody_is_read_while_the_bus_waits_not_even_a_dead_client();
   who_does_not_read_is_disconnected_by_name();
+  time_the_hub_was_stopped_is_not_held_against_a_reader();
+  who_floods_does_not_keep_a_quiet_sender_waiting();
+  who_connects_while_the_bus_waits_gets_what_comes_after();
   garbage_is_counted_and_harms_nobody();
   the_last_frames_of_a_dying_client_arrive();
   a_client_that_only_sends_holds_nobody_up();
