@@ -185,13 +185,17 @@ static void remove_own_socket(const char *path, const struct stat *identity)
   }
 }
 
+enum { ACCEPT_PAUSE_NS = 100000000 }; /* out of descriptors: a listener that stays readable must not be a busy loop */
+static bool out_of_descriptors;
+
 static bool accept_one(hub_t *hub, int listener)
 {
   const int fd = accept4(listener, NULL, NULL, SOCK_CLOEXEC | SOCK_NONBLOCK);
   struct ucred who = {0};
   socklen_t size = sizeof who;
-  char path[32], name[HUB_NAME_MAX] = "";
+  char path[32], name[HUB_NAME_MAX + 1] = ""; /* with the newline */
   if (fd < 0) {
+    out_of_descriptors = errno == EMFILE || errno == ENFILE || errno == ENOBUFS || errno == ENOMEM;
     return false;
   }
   (void)getsockopt(fd, SOL_SOCKET, SO_PEERCRED, &who, &size);
@@ -199,7 +203,8 @@ static bool accept_one(hub_t *hub, int listener)
   const int comm = open(path, O_RDONLY | O_CLOEXEC);
   if (comm >= 0) {
     const ssize_t n = read(comm, name, sizeof name - 1);
-    name[n > 0 ? n - 1 : 0] = '\0'; /* the newline */
+    name[n > 0 ? n : 0] = '\0';
+    name[strcspn(name, "\n")] = '\0';
     (void)close(comm);
   }
   if (!hub_add(hub, fd, who.pid, name)) {
@@ -210,6 +215,7 @@ static bool accept_one(hub_t *hub, int listener)
 
 static void accept_all(hub_t *hub, int listener)
 {
+  out_of_descriptors = false;
   while (accept_one(hub, listener)) {
   }
 }
@@ -270,9 +276,14 @@ static void serve(hub_t *hub, int listener, int signals, double *stall_s)
   struct pollfd fds[2 + HUB_CLIENTS_MAX];
   fds[0] = (struct pollfd){.fd = signals, .events = POLLIN};
   fds[1] = (struct pollfd){.fd = listener, .events = POLLIN};
+  int64_t listen_ns = 0; /* not before */
   while ((fds[0].revents & POLLIN) == 0) {
     const size_t count = hub_poll_set(hub, &fds[2]);
-    if (poll(fds, (nfds_t)(2 + count), hub_poll_timeout_ms(hub)) < 0) {
+    int timeout_ms = hub_poll_timeout_ms(hub);
+    const int64_t left_ns = out_of_descriptors ? listen_ns - now_ns() : 0;
+    fds[1].fd = left_ns > 0 ? -1 : listener;
+    timeout_ms = timeout_ms < 0 && left_ns > 0 ? (int)(left_ns / 1000000) + 1 : timeout_ms;
+    if (poll(fds, (nfds_t)(2 + count), timeout_ms) < 0) {
       continue; /* EINTR */
     }
     if (hub->blocked) {
@@ -284,6 +295,7 @@ static void serve(hub_t *hub, int listener, int signals, double *stall_s)
     }
     if ((fds[1].revents & POLLIN) != 0) {
       accept_all(hub, listener);
+      listen_ns = now_ns() + ACCEPT_PAUSE_NS;
     }
   }
 }

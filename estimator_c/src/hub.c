@@ -90,6 +90,8 @@ int hub_poll_timeout_ms(const hub_t *self)
 void hub_hand_out(hub_t *self, int64_t now_ns, hub_on_stall_t on_stall, void *context)
 {
   bool blocked = false;
+  const int64_t pause_ns = now_ns - self->blocked_since_ns - (int64_t)HUB_PAUSE_MS * 1000000;
+  const int64_t own_ns = self->blocked && pause_ns > 0 ? pause_ns : 0; /* we were stopped: nobody could have been served */
   self->fresh = false;
   for (uint32_t i = 0; i < self->top; i++) {
     hub_client_t *c = &self->clients[i];
@@ -100,9 +102,7 @@ void hub_hand_out(hub_t *self, int64_t now_ns, hub_on_stall_t on_stall, void *co
         c->blocked_since_ns = -1;
         self->counters.delivered += (uint64_t)n;
       } else if (errno == EAGAIN || errno == ENOBUFS || errno == ENOMEM) {
-        if (c->blocked_since_ns < 0) {
-          c->blocked_since_ns = now_ns;
-        }
+        c->blocked_since_ns = c->blocked_since_ns < 0 ? now_ns : c->blocked_since_ns + own_ns;
         if (now_ns - c->blocked_since_ns < self->stall_ns) {
           blocked = true;
         } else {

@@ -6,7 +6,11 @@
  * One total order, nothing lost: the hub takes a batch of frames from ONE client and takes nothing from anybody until
  * all others have that batch. So all see the same order, and a slow reader holds the senders back instead of losing
  * frames. A reader that takes nothing for `stall_ns` while the bus waits for it is disconnected: one stopped process
- * must not freeze the bus for ever.
+ * must not freeze the bus for ever. Time in which the hub itself did not run is not held against a reader.
+ *
+ * Half-closed connections: a client that has shut down its reading side is a sender, gets nothing and holds nobody up. One
+ * that has shut down its writing side is taken for gone once what it had sent is read: it is disconnected, after the frames
+ * queued for it it reads the end. There is no client that only listens by half-closing; it simply does not send.
  *
  * The core knows no listening socket, no signals and no clock: the caller polls, and says what time it is.
  * Memory: the caller owns the hub; nothing is allocated. Threads: one. Blocking: never.
@@ -26,6 +30,7 @@ enum {
   HUB_CLIENTS_MAX = 32,
   HUB_BATCH = 16,    /* frames taken from one client before the next has its turn */
   HUB_NAME_MAX = 16, /* a process name, as in /proc/PID/comm */
+  HUB_PAUSE_MS = 100, /* a longer pause between two looks at a full reader was the hub's own: it counts as this */
   HUB_RETRY_MS = 1,  /* while a reader is full: AF_UNIX reports POLLOUT only once 3/4 of its queue are free */
 };
 

@@ -3,11 +3,13 @@
 import fcntl
 import json
 import os
+import resource
 import select
 import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import can
@@ -289,6 +291,61 @@ def test_a_starting_hub_waits_for_another_that_is_starting(tmp_path):
         p.kill()
         p.communicate()
         os.close(folder)
+
+
+def cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def test_out_of_descriptors_it_waits_without_spinning_and_serves_who_is_in(hub):
+    pid = hub.hub.process.pid
+    first, second = raw_client(hub.hub.path), raw_client(hub.hub.path)
+    first.send(frame(0x1))
+    assert second.recv(100) == frame(0x1)  # both are in
+    used = len(os.listdir(f"/proc/{pid}/fd"))
+    resource.prlimit(pid, resource.RLIMIT_NOFILE, (used, used))
+    waiting = raw_client(hub.hub.path)
+    before = cpu_s(pid)
+    time.sleep(1.0)
+    assert cpu_s(pid) - before < 0.3
+    first.send(frame(0x2))
+    assert second.recv(100) == frame(0x2)
+    second.close()  # makes room
+    first.settimeout(0.05)
+    waiting.send(frame(0x3))
+    wait_until(lambda: _receives(first, frame(0x3)))
+    first.send(frame(0x4))
+    assert waiting.recv(100) == frame(0x4)
+    first.close(), waiting.close()
+
+
+def _receives(client: socket.socket, expected: bytes) -> bool:
+    try:
+        return client.recv(100) == expected
+    except TimeoutError:
+        return False
+
+
+def test_a_process_name_of_fifteen_letters_is_whole(tmp_path):
+    hub = Hub(tmp_path / "hub", "--stall-s", "0.05")
+    stuck = subprocess.Popen([sys.executable, "-c", STUCK, hub.path], stdout=subprocess.PIPE)
+    assert stuck.stdout.readline() == b"in\n"
+    client = Client(hub.bus, "send", 30_000)
+    assert client.end()[0] == 0
+    _, _, err = hub.end(signal.SIGTERM)
+    stuck.kill(), stuck.communicate()
+    assert f"disconnected client {stuck.pid} (fifteen_letters)" in err
+
+
+STUCK = """
+import socket, sys, time
+open("/proc/self/comm", "w").write("fifteen_letters")
+s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+s.connect(sys.argv[1])
+print("in", flush=True)
+time.sleep(60)
+"""
 
 
 def test_a_full_table_refuses_politely(hub):

@@ -119,7 +119,7 @@ def as_sent(frames: list[can.Message]) -> list[tuple[int, bytes]]:
 
 def test_a_run_from_ready_to_result(buses, start, tmp_path):
     (tmp_path / "lap.toml").write_text("title = 'a lap'\n")
-    config = {"run": {"scenario": "lap", "seed": "3"}, "attachments": {"scenario.toml": str(tmp_path / "lap.toml")}}
+    config = {"run": {"scenario": "lap", "seed": "3"}, "files": {"scenario.toml": str(tmp_path / "lap.toml")}}
     logger = start(buses.bus, config=config)
     frames, sender = drive(1500), buses.open()
     before_ns = time.time_ns()

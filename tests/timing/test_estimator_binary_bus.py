@@ -223,8 +223,9 @@ def test_no_heap_and_no_page_fault_in_the_loop(hub, tmp_path):
 def test_a_ready_line_that_nobody_gets_is_one_line_and_exit_1(hub):
     with open("/dev/full", "w") as full:
         for args in (["--help"], ["--bus", hub.bus, "--no-rt"]):
-            done = subprocess.run([binary("release"), *args], stdout=full, stderr=subprocess.PIPE, text=True, timeout=10,
-                                  check=False)  # fmt: skip
+            done = subprocess.run(
+                [binary("release"), *args], stdout=full, stderr=subprocess.PIPE, text=True, timeout=10, check=False
+            )
             assert done.returncode == 1
             assert done.stderr.startswith("rt_estimator: stdout: cannot write the ")
             assert len(done.stderr.splitlines()) == 1

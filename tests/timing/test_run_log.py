@@ -40,13 +40,22 @@ def test_it_says_which_bus_it_took_and_why(run):
     assert run.result["bus"] == run.bus
 
 
+def test_what_no_neighbour_can_spoil_passes(run):
+    """The machine may be taken from us (timing: inconclusive); figures, counters and log may not suffer from it."""
+    findings = {f["what"]: f for f in run.result["findings"]}
+    for what in ("theta_w accuracy", "theta_r accuracy", "conservation", "log"):
+        assert findings[what]["verdict"] == "pass", findings[what]
+    for channel in ("theta_w", "theta_r"):
+        figures = run.result["accuracy"][channel]
+        assert figures["est_rmse_degc"] <= 0.25
+        assert figures["raw_rmse_degc"] >= 1.0
+
+
 def test_every_release_is_accounted_for(run):
     unwrap = Unwrapper(24)
     indices = [unwrap(v["release_index"]) for _, v, _ in run.frames["EstTimingA"]]
     assert indices == sorted(set(indices)), "a release ran twice, or out of order"
-    released = indices[-1] - indices[0] + 1
     skipped = sum(b - a - 1 for a, b in itertools.pairwise(indices))
-    assert len(indices) + skipped == released
     final_releases, final_misses = run.frames["EstReleases"][-1][1], run.frames["EstMisses"][-1][1]
     assert final_releases["releases"] == final_releases["jobs"] + final_misses["miss_skipped"]
     assert final_releases["jobs"] == len(indices), "executed jobs and logged jobs differ"

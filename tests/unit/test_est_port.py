@@ -1,4 +1,4 @@
-"""The estimator's cycle on a bus port with a played other end (tests/c/test_est_port.c), plain and under the sanitizers."""
+"""The estimator's cycle on a bus port with a played other end (tests/c/test_est_port.c), plain and sanitized."""
 
 from __future__ import annotations
 
