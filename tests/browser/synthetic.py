@@ -96,8 +96,10 @@ def _job(run: Run, t_ns: int, t_s: float, tick: int, release: int, rng: np.rando
     yield t, "Estimate", {"status": 1 if starting else 2, "tick": tick,
                           "theta_w_est_degc": None if starting else w - off + noise[0],
                           "theta_r_est_degc": None if starting else r + off + noise[1]}  # fmt: skip
-    yield t, "EstTimingA", {"miss_late": int(late), "warmup": int(release < 5), "stale_input": 0, "after_skip": 0,
-                            "release_index": release, "wake_lat_us": None if run.lockstep else wake}  # fmt: skip
+    skipped_before = int(release > 1 and run.skipped(release - 1))
+    yield t, "EstTimingA", {"miss_late": int(late), "warmup": int(release < 5), "stale_input": 0,
+                            "after_skip": skipped_before, "release_index": release,
+                            "wake_lat_us": None if run.lockstep else wake}  # fmt: skip
     yield t, "EstTimingB", {"miss_cause": 2 if late else 0, "exec_wall_us": step, "resp_us": resp}
 
 

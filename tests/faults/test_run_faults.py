@@ -368,7 +368,11 @@ def test_a_killed_supervisor_takes_its_children_along_and_leaves_a_finished_log(
     while time.monotonic() < deadline and any(Path(f"/proc/{p}").exists() for p in pids):
         time.sleep(0.1)
     assert not [p for p in pids if Path(f"/proc/{p}").exists()]
-    assert summarise(run.log).complete
+    summary = summarise(run.log)
+    assert summary.complete
+    assert summary.result is not None
+    assert summary.result["verdict"] == "fail"
+    assert summary.result["scenario"] == "hot-lap"
 
 
 def test_frames_with_a_bad_crc_are_counted_and_not_believed(live):
