@@ -19,6 +19,10 @@ REPEATED, WRONG_CRC = 1, 4  # E2E states as in the log
 STATUS_SHOWN = ("init", "starting", "ok", "predicting", "input_stale", "invalid")
 CAUSES = ("none", "late_wake", "preempted", "long_compute", "stale_input", "blocked_send")
 MACHINE_CAUSES = ("late_wake", "preempted")
+CORE_FAULTS = {
+    "EstCoreFaults": ("restarts", "held_intervals", "late_measurements", "stray_ticks"),
+    "EstCoreFaults2": ("off_grid", "invalid_inputs", "unconverged", "repeated_ticks"),
+}
 
 
 @dataclass(frozen=True)
@@ -293,6 +297,7 @@ class ResultAccumulator:
             "environment": {"steal_ms": facts.steal_ms, "warnings": facts.granted.get("warnings", [])},
             "input_faults": {k: self._count("EstInputFaults", k) for k in ("crc_errors", "seq_errors", "stale_inputs")},
             "bus_faults": {k: self._count("EstBusFaults", k) for k in ("rx_drops", "tx_drops", "rejected")},
+            "core_faults": {k: self._count(m, k) for m, ks in CORE_FAULTS.items() for k in ks},
             "plant": {
                 "ticks_late": self._count("PlantStatus", "ticks_late"),
                 "late_max_ms": self._last.get("PlantStatus", {}).get("late_max_ms"),

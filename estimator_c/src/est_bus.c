@@ -211,11 +211,33 @@ static void bus_faults(est_bus *self, const est_counters *in, struct canfd_frame
     SEAL(self, DRIVE_INDEX_EST_BUS_FAULTS, est_bus_faults, raw, frame);
 }
 
+static void core_faults(est_bus *self, const est_counters *in, struct canfd_frame *frame) {
+    struct drive_est_core_faults_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.stray_ticks = drive_est_core_faults_stray_ticks_to_raw((double)in->stray_ticks);
+    raw.restarts = drive_est_core_faults_restarts_to_raw((double)in->restarts);
+    raw.held_intervals = drive_est_core_faults_held_intervals_to_raw((double)in->held_intervals);
+    raw.late_measurements = drive_est_core_faults_late_measurements_to_raw((double)in->late_measurements);
+    SEAL(self, DRIVE_INDEX_EST_CORE_FAULTS, est_core_faults, raw, frame);
+}
+
+static void core_faults2(est_bus *self, const est_counters *in, struct canfd_frame *frame) {
+    struct drive_est_core_faults2_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.repeated_ticks = drive_est_core_faults2_repeated_ticks_to_raw((double)in->repeated_ticks);
+    raw.off_grid = drive_est_core_faults2_off_grid_to_raw((double)in->off_grid);
+    raw.invalid_inputs = drive_est_core_faults2_invalid_inputs_to_raw((double)in->invalid_inputs);
+    raw.unconverged = drive_est_core_faults2_unconverged_to_raw((double)in->unconverged);
+    SEAL(self, DRIVE_INDEX_EST_CORE_FAULTS2, est_core_faults2, raw, frame);
+}
+
 void est_bus_counters(est_bus *self, const est_counters *in, struct canfd_frame frames[EST_COUNTER_FRAMES]) {
     releases(self, in, &frames[0]);
     misses(self, in, &frames[1]);
     input_faults(self, in, &frames[2]);
     bus_faults(self, in, &frames[3]);
+    core_faults(self, in, &frames[4]);
+    core_faults2(self, in, &frames[5]);
 }
 
 void est_bus_identity(est_bus *self, const est_identity *in, struct canfd_frame frames[EST_IDENTITY_FRAMES]) {

@@ -100,6 +100,8 @@ typedef struct {
     uint64_t releases, jobs, miss_late, miss_skipped, overrun;
     uint64_t crc_errors, seq_errors, stale_inputs;
     uint64_t rx_drops, tx_drops, rejected;
+    uint64_t restarts, held_intervals, late_measurements, stray_ticks;
+    uint64_t off_grid, invalid_inputs, unconverged, repeated_ticks;
 } est_counters;
 
 typedef struct {
@@ -139,8 +141,8 @@ void est_bus_innov(est_bus *self, const est_output *in, struct canfd_frame *fram
 void est_bus_timing_a(est_bus *self, const est_timing *in, struct canfd_frame *frame);
 void est_bus_timing_b(est_bus *self, const est_timing *in, struct canfd_frame *frame);
 
-enum { EST_COUNTER_FRAMES = 4, EST_IDENTITY_FRAMES = 3 };
-/* EstReleases, EstMisses, EstInputFaults, EstBusFaults. */
+enum { EST_COUNTER_FRAMES = 6, EST_IDENTITY_FRAMES = 3 };
+/* EstReleases, EstMisses, EstInputFaults, EstBusFaults, EstCoreFaults, EstCoreFaults2. */
 void est_bus_counters(est_bus *self, const est_counters *in, struct canfd_frame frames[EST_COUNTER_FRAMES]);
 /* EstIdentity, EstBuild, EstGranted. */
 void est_bus_identity(est_bus *self, const est_identity *in, struct canfd_frame frames[EST_IDENTITY_FRAMES]);

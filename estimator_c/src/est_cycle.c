@@ -143,6 +143,7 @@ void est_cycle_counters(const est_cycle *self, est_counters *out) {
     est_bus_read_faults(&self->bus, &faults);
     self->io.counters(self->io.ctx, &io);
     const rt_tally *tally = &self->task.total;
+    const estimator_counters_t *core = &self->estimator.counters;
     const est_counters counters = {
         .releases = tally->releases,
         .jobs = tally->jobs,
@@ -155,6 +156,14 @@ void est_cycle_counters(const est_cycle *self, est_counters *out) {
         .rx_drops = io.rx_drops,
         .tx_drops = io.tx_drops,
         .rejected = io.rejected + io.error_frames + faults.rejected,
+        .restarts = core->restarts,
+        .held_intervals = core->held_intervals,
+        .late_measurements = core->late_measurements,
+        .stray_ticks = core->stray_ticks,
+        .off_grid = core->off_grid,
+        .invalid_inputs = core->invalid_inputs,
+        .unconverged = core->unconverged,
+        .repeated_ticks = core->repeated_ticks,
     };
     *out = counters;
 }

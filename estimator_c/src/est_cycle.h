@@ -3,7 +3,7 @@
  *     frames → est_bus (E2E, decode) → estimator → est_bus (encode, E2E) → frames
  *
  * Frames leave in this order: Estimate, EstimateInnov, then (response time known) EstTimingA, EstTimingB; once a second
- * of release time the four counter frames; with the first job and every ten seconds the three identity frames.
+ * of release time the six counter frames; with the first job and every ten seconds the three identity frames.
  * No allocation, no lock, no printing. One thread; the caller owns the object. */
 #ifndef EST_CYCLE_H
 #define EST_CYCLE_H
@@ -58,7 +58,7 @@ est_cycle_status est_cycle_run_released(est_cycle *self);
 /* The counters as they are published. O(1). */
 void est_cycle_counters(const est_cycle *self, est_counters *out);
 
-/* Sends the four counter frames once more, after the last job. */
+/* Sends the six counter frames once more, after the last job. */
 est_cycle_status est_cycle_send_final(est_cycle *self);
 
 #endif

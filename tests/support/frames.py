@@ -44,6 +44,16 @@ GOLDEN: list[tuple[str, dict[str, float], str]] = [
     ("EstInputFaults", {"crc_errors": 16383.0, "seq_errors": 32767.0, "stale_inputs": 49151.0}, "fd01ff3fff7fffbf"),
     ("EstBusFaults", {"rx_drops": 16383.0, "tx_drops": 32767.0, "rejected": 49151.0}, "d501ff3fff7fffbf"),
     (
+        "EstCoreFaults",
+        {"stray_ticks": 7.0, "restarts": 16383.0, "held_intervals": 32767.0, "late_measurements": 49151.0},
+        "3971ff3fff7fffbf",
+    ),
+    (
+        "EstCoreFaults2",
+        {"repeated_ticks": 11.0, "off_grid": 16383.0, "invalid_inputs": 32767.0, "unconverged": 49151.0},
+        "33b1ff3fff7fffbf",
+    ),
+    (
         "TruthTemp",
         {"theta_w_true_degc": 27.998046875, "theta_r_true_degc": 155.998046875, "tick": 49151.0},
         "16f1ffcfff7fffbf",

@@ -29,7 +29,7 @@ DBC_SHA256 = hashlib.sha256(DEFAULT_DBC.read_bytes()).hexdigest()
 MS = 1_000_000
 TICK_NS = 10 * MS
 PER_JOB = ("Estimate", "EstimateInnov", "EstTimingA", "EstTimingB")
-COUNTERS = ("EstReleases", "EstMisses", "EstInputFaults", "EstBusFaults")
+COUNTERS = ("EstReleases", "EstMisses", "EstInputFaults", "EstBusFaults", "EstCoreFaults", "EstCoreFaults2")
 IDENTITY = ("EstIdentity", "EstBuild", "EstGranted")
 
 

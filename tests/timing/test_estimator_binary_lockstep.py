@@ -164,6 +164,39 @@ def test_what_is_damaged_or_foreign_changes_no_estimate(release, extras):
     assert bus_faults["rejected"] == final["rejected"]
 
 
+def test_what_the_core_put_up_with_is_on_the_bus(program):
+    """A stray tick, values not available, a temperature off the grid and one too late, a gap, a plant that starts again."""
+    plant, records = Plant(), []
+    for tick in range(1001):
+        t_ns = tick * TICK_NS
+        if not 500 <= tick < 530:
+            records.append(Record(t_ns, 0x0A0, plant.motor(tick, torque_nm=None if 600 <= tick < 605 else 50.0)))
+        if tick % 10 == 0:
+            records.append(Record(t_ns, 0x1A0, plant.temp(tick)))
+        if tick in (300, 301, 302):
+            records.append(Record(t_ns, 0x0A0, plant.motor(7)))
+            records.append(Record(t_ns, 0x0A0, plant.motor(tick + 1)))
+            records.append(Record(t_ns, 0x0A0, plant.motor(tick + 1)))
+        if tick in (700, 720):
+            records.append(Record(t_ns, 0x1A0, plant.temp(tick + 3)))
+        if tick == 800:
+            records.append(Record(t_ns, 0x1A0, plant.temp(400)))
+        records.append(tick_record(t_ns))
+    for tick in range(400):
+        t_ns = (1001 + tick) * TICK_NS
+        records += [Record(t_ns, i, d) for i, d in plant.frames(tick)] + [tick_record(t_ns)]
+    run = run_drive(program, records)
+    first, second = run.named("EstCoreFaults")[-1].values, run.named("EstCoreFaults2")[-1].values
+    found = {k: v for k, v in {**first, **second}.items() if k not in ("crc", "counter")}
+    assert found == run.final["estimator"]
+    assert (found["restarts"], found["stray_ticks"], found["held_intervals"]) == (1, 4, 2)
+    # Both channels of the frame too late, and of the new plant's first one, which comes before the restart.
+    assert (found["invalid_inputs"], found["late_measurements"]) == (5, 4)
+    assert found["off_grid"] >= 2
+    assert found["repeated_ticks"] >= 3
+    assert run.named("EstCoreFaults")[0].values["stray_ticks"] == 0, "once a second, not only at the end"
+
+
 def test_lost_frames_are_counted_and_the_drive_goes_on(program):
     records = [r for r in drive(range(1001)) if not (r.can_id == 0x0A0 and r.t_ns // TICK_NS in (400, 401, 700))]
     run = run_drive(program, records)

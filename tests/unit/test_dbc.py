@@ -40,6 +40,12 @@ CONTRACT = {
         n: (s, *U16, 1, 0, False) for n, s in (("crc_errors", 16), ("seq_errors", 32), ("stale_inputs", 48))}),
     "EstBusFaults": (0x4A3, "ESTIMATOR", 1000, {
         n: (s, *U16, 1, 0, False) for n, s in (("rx_drops", 16), ("tx_drops", 32), ("rejected", 48))}),
+    "EstCoreFaults": (0x4A4, "ESTIMATOR", 1000, {
+        "stray_ticks": (12, 4, False, 1, 0, False),
+        **{n: (s, *U16, 1, 0, False) for n, s in (("restarts", 16), ("held_intervals", 32), ("late_measurements", 48))}}),
+    "EstCoreFaults2": (0x4A5, "ESTIMATOR", 1000, {
+        "repeated_ticks": (12, 4, False, 1, 0, False),
+        **{n: (s, *U16, 1, 0, False) for n, s in (("off_grid", 16), ("invalid_inputs", 32), ("unconverged", 48))}}),
     "TruthTemp": (0x6A0, "PLANT", 100, {
         "theta_w_true_degc": (12, 18, False, 1 / 512, -100, True),
         "theta_r_true_degc": (30, 18, False, 1 / 512, -100, True), "tick": (48, *U16, 1, 0, False)}),
