@@ -3,6 +3,8 @@
 #include <stddef.h>
 #include <string.h>
 
+_Static_assert((int)EST_CYCLE_FRAMES_PER_JOB <= 10, "txqueuelen of a CAN interface: more at once would be lost");
+
 static const int64_t NS_PER_S = 1000000000;
 static const int64_t IDENTITY_EVERY_S = 10;
 
@@ -182,18 +184,22 @@ static int64_t next_due(int64_t due_ns, int64_t every_ns, int64_t now_ns) {
 }
 
 static est_cycle_status housekeeping(est_cycle *self, const rt_job *job) {
-    est_cycle_status status = EST_CYCLE_OK;
-    if (job->release_ns >= self->next_counters_ns) {
+    /* Where both are due the counters go first and the identity with the next job, whatever is due then. */
+    const bool counters_due = job->release_ns >= self->next_counters_ns;
+    const bool identity_due = job->release_ns >= self->next_identity_ns;
+    if (counters_due && !(identity_due && self->identity_waits)) {
         self->next_counters_ns = next_due(self->next_counters_ns, NS_PER_S, job->release_ns);
-        status = est_cycle_send_final(self);
+        self->identity_waits = identity_due;
+        return est_cycle_send_final(self);
     }
-    if (status == EST_CYCLE_OK && job->release_ns >= self->next_identity_ns) {
+    if (identity_due) {
         self->next_identity_ns = next_due(self->next_identity_ns, IDENTITY_EVERY_S * NS_PER_S, job->release_ns);
+        self->identity_waits = false;
         struct canfd_frame frames[EST_IDENTITY_FRAMES];
         est_bus_identity(&self->bus, &self->identity, frames);
-        status = send_all(self, frames, EST_IDENTITY_FRAMES);
+        return send_all(self, frames, EST_IDENTITY_FRAMES);
     }
-    return status;
+    return EST_CYCLE_OK;
 }
 
 static est_cycle_status run(est_cycle *self, rt_job *job) {

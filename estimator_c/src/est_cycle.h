@@ -3,7 +3,8 @@
  *     frames → est_bus (E2E, decode) → estimator → est_bus (encode, E2E) → frames
  *
  * Frames leave in this order: Estimate, EstimateInnov, then (response time known) EstTimingA, EstTimingB; once a second
- * of release time the six counter frames; with the first job and every ten seconds the three identity frames.
+ * of release time the six counter frames; with the first job and every ten seconds the three identity frames, but never in
+ * one job with the counters: at most ten frames leave together (EST_CYCLE_FRAMES_PER_JOB), the send queue of a CAN interface.
  * No allocation, no lock, no printing. One thread; the caller owns the object. */
 #ifndef EST_CYCLE_H
 #define EST_CYCLE_H
@@ -17,6 +18,8 @@
 #include "rt_task.h"
 
 enum { EST_CYCLE_MAX_FRAMES = 4096 }; /* frames one job reads at most; the rest waits for the next job */
+
+enum { EST_CYCLE_FRAMES_PER_JOB = 4 + EST_COUNTER_FRAMES }; /* most that one job sends */
 
 typedef enum {
     EST_CYCLE_OK = 0,
@@ -35,6 +38,7 @@ typedef struct {
     est_identity identity;
     int64_t next_counters_ns;   /* release time from which the counters are due */
     int64_t next_identity_ns;
+    bool identity_waits;        /* the job before sent counters instead */
     uint64_t stale_jobs;        /* jobs made without fresh input */
     uint64_t estimates_sent;    /* jobs = estimates_sent + estimates_lost */
     uint64_t estimates_lost;
