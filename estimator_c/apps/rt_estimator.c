@@ -217,6 +217,11 @@ static int run_on_bus(const options *opt) {
     }
     const est_io io = est_port_io(&port_state, &port);
     rt_grant_apply(&opt->request, &granted);
+    if (est_port_short_of(&port_state, opt->period_us) > 0) {
+        rt_grant_warn(&granted, "send buffer of %d bytes granted, %d short of a second of frames: needs CAP_NET_ADMIN or a larger "
+                      "net.core.wmem_max; frames are lost when the hub is held up",
+                      port_state.send_buffer_bytes, est_port_short_of(&port_state, opt->period_us));
+    }
     if (set_up(opt, &io, &granted) != EST_CYCLE_OK) {
         can_port_close(&port);
         return fail("setting '%s' does not fit this build; change estimator_c/settings and build again", opt->setting->name);

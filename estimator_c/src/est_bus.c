@@ -3,6 +3,8 @@
 #include <math.h>
 #include <string.h>
 
+_Static_assert(sizeof(est_bus) <= 75000, "est_bus.h says so");
+
 static const enum drive_index RX_INDEX[EST_RX_COUNT] = {DRIVE_INDEX_MOTOR_STATE, DRIVE_INDEX_TEMP_MEAS};
 
 static const int64_t NS_PER_MS = 1000000;

@@ -57,7 +57,7 @@ typedef struct {
     rt_stats age_ns;        /* of the newest such frame when a job looked */
 } est_rx;
 
-/* About 75 kB: belongs in static storage. */
+/* Up to 75 kB (checked where it is compiled): belongs in static storage. */
 typedef struct {
     est_rx rx[EST_RX_COUNT];
     e2e_sender_t tx[DRIVE_MESSAGE_COUNT];

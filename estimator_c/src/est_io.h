@@ -1,6 +1,7 @@
 /* What the estimator's cycle needs of a bus: frames in with their arrival time, frames out, and the losses.
  *
- * Two implementations: est_port (a real bus) and est_lockstep (records over pipes). None blocks or allocates. */
+ * Two implementations: est_port (a real bus), which never blocks, and est_lockstep (records over pipes), whose sends wait for
+ * the pipe's reader. Neither allocates. */
 #ifndef EST_IO_H
 #define EST_IO_H
 

@@ -4,6 +4,8 @@
 
 #include "can_port.h"
 
+_Static_assert(sizeof(est_lockstep) <= 240000, "est_lockstep.h says so");
+
 static void begin(void *ctx, int64_t now_ns) {
     ((est_lockstep *)ctx)->now_ns = now_ns;
 }

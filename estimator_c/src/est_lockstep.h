@@ -22,7 +22,7 @@ typedef enum {
     EST_LOCKSTEP_JUMP = 2       /* more than EST_LOCKSTEP_MAX_STEP_NS after it */
 } est_lockstep_status;
 
-/* About 380 kB with its buffers: belongs in static storage. */
+/* Up to 240 kB with its buffers (checked where it is compiled): belongs in static storage. */
 typedef struct {
     rt_record_reader reader;
     rt_record_writer writer;

@@ -4,9 +4,13 @@
 #include <sys/socket.h>
 
 #include "drive_e2e.h"
+#include "est_cycle.h"
 #include "rt_clock.h"
 
-enum { SEND_BUFFER_BYTES = 4 << 20 };
+enum {
+    SEND_BUFFER_BYTES = 4 << 20,
+    QUEUED_FRAME_BYTES = 800 /* what a queued frame costs the kernel: 212992 bytes hold 277 */
+};
 
 _Static_assert((int)CAN_PORT_SKIP_MAX == (int)EST_IO_SKIP_COST, "a skip costs what the cycle takes it to cost");
 
@@ -49,15 +53,19 @@ static est_io_status receive(void *ctx, struct canfd_frame *frame, int64_t *at_n
 }
 
 static est_io_status transmit(void *ctx, const struct canfd_frame *frame) {
-    return status_of(can_port_send(((est_port *)ctx)->port, frame));
+    est_port *self = ctx;
+    const can_port_status_t status = can_port_send(self->port, frame);
+    self->refused += status == CAN_PORT_REFUSED ? 1U : 0U;
+    return status_of(status);
 }
 
 static void counters(void *ctx, est_io_counters *out) {
-    const can_port_counters_t *from = &((const est_port *)ctx)->port->counters;
+    const est_port *self = ctx;
+    const can_port_counters_t *from = &self->port->counters;
     out->received = from->received;
     out->sent = from->sent;
     out->rx_drops = from->rx_drops;
-    out->tx_drops = from->tx_drops;
+    out->tx_drops = from->tx_drops + self->refused;
     out->rejected = from->rejected;
     out->error_frames = from->error_frames;
 }
@@ -67,12 +75,18 @@ est_io est_port_io(est_port *self, can_port_t *port) {
     self->offset_ns = 0;
     self->now_ns = 0;
     self->drained_ns = 0;
+    self->refused = 0;
+    self->send_buffer_bytes = 0;
     if (port->hub) {
         /* The hub is an ordinary process: when it does not get the processor, our frames wait here. The default holds
          * 0.07 s of a 1 ms loop; this holds a second. */
+        socklen_t size = sizeof self->send_buffer_bytes;
         const int bytes = SEND_BUFFER_BYTES;
         if (setsockopt(port->fd, SOL_SOCKET, SO_SNDBUFFORCE, &bytes, sizeof bytes) != 0) {
             (void)setsockopt(port->fd, SOL_SOCKET, SO_SNDBUF, &bytes, sizeof bytes); /* capped by net.core.wmem_max */
+        }
+        if (getsockopt(port->fd, SOL_SOCKET, SO_SNDBUF, &self->send_buffer_bytes, &size) != 0) {
+            self->send_buffer_bytes = 0;
         }
     } else {
         /* On the hub every frame is read anyway: the port would filter here, after the system call. */
@@ -84,4 +98,10 @@ est_io est_port_io(est_port *self, can_port_t *port) {
     }
     const est_io io = {self, begin, receive, transmit, counters};
     return io;
+}
+
+int est_port_short_of(const est_port *self, int64_t period_us) {
+    const int64_t frames = EST_CYCLE_FRAMES_PER_JOB + 4 * INT64_C(1000000) / period_us;
+    const int64_t lacking = frames * QUEUED_FRAME_BYTES - self->send_buffer_bytes;
+    return self->send_buffer_bytes > 0 && lacking > 0 ? (int)lacking : 0;
 }

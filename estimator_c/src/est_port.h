@@ -14,11 +14,18 @@ typedef struct {
     can_port_t *port;
     int64_t offset_ns;   /* CLOCK_REALTIME - CLOCK_MONOTONIC, read anew at every job */
     int64_t now_ns;      /* start of the job */
+    uint64_t refused;    /* frames of ours that the port would not send; counted in tx_drops */
+    int send_buffer_bytes; /* hub: what the kernel gave us, its own bookkeeping included; 0: SocketCAN, or unknown */
     int64_t drained_ns;  /* everything that arrived before this has been read: start of the last job that read to EMPTY */
 } est_port;
 
-/* Wraps an open port, tells a SocketCAN kernel which ids we want, and gives a hub's socket room for a second of frames. Both objects stay with the caller and outlive the
- * result. Never fails: without the filter the cycle ignores foreign ids itself. */
+/* Wraps an open port, tells a SocketCAN kernel which ids we want, and asks for room for a second of frames at the shortest
+ * period on a hub's socket; without CAP_NET_ADMIN the kernel gives at most net.core.wmem_max (est_port_short_of says
+ * whether that is enough). Both objects stay with the caller and outlive the result. Never fails: without the filter the
+ * cycle ignores foreign ids itself. */
 est_io est_port_io(est_port *self, can_port_t *port);
+
+/* Bytes that the send buffer lacks to hold a second of frames at this period; 0: enough, or no matter (SocketCAN). O(1). */
+int est_port_short_of(const est_port *self, int64_t period_us);
 
 #endif

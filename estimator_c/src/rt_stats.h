@@ -35,8 +35,8 @@ typedef struct {
     uint64_t overflow;
     int64_t min_ns;            /* valid when count > 0 */
     int64_t max_ns;
-    uint64_t min_index;        /* release index of the first smallest value */
-    uint64_t max_index;        /* release index of the first largest value */
+    uint64_t min_index;        /* `index` given with the first smallest value: a release, or whatever the caller counts */
+    uint64_t max_index;        /* the same of the first largest value */
     double mean_ns;            /* Welford */
     double m2_ns2;             /* sum of squared deviations */
     uint64_t bucket[RT_STATS_BUCKETS];
@@ -76,7 +76,7 @@ extern const char *const rt_stats_quantile_name[RT_STATS_QUANTILES];
 /* Empties `self` (about 18 kB are written). Cannot fail. */
 void rt_stats_init(rt_stats *self);
 
-/* Adds one value measured at release `index`. O(1), about 10 ns. Cannot fail. */
+/* Adds one value; `index` says which one it was (a release, a frame, ...). O(1), about 10 ns. Cannot fail. */
 void rt_stats_add(rt_stats *self, int64_t value_ns, uint64_t index);
 
 /* Nearest-rank quantile: the smallest value v such that at least p of all samples are <= v. `per_10k` is p in 1/10 000

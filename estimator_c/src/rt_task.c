@@ -3,6 +3,8 @@
 #include <stddef.h>
 #include <string.h>
 
+_Static_assert(sizeof(rt_task) <= 450000, "rt_task.h says so");
+
 const char *const rt_metric_name[RT_METRICS] = {
     "wake_lat_us", "exec_wall_us", "exec_cpu_us", "preempt_us", "publish_us", "resp_us", "period_dev_abs_us",
 };

@@ -170,7 +170,38 @@ static void no_arrival_is_of_the_future_or_before_the_last_empty_look(void) {
     disconnect_port();
 }
 
+static void a_frame_the_port_refuses_is_counted_as_lost(void) {
+    connect_port();
+    const struct canfd_frame nonsense = {.can_id = 1, .len = 9};
+    est_io_counters counters;
+    CHECK(io.send(io.ctx, &nonsense) == EST_IO_FULL);
+    io.counters(io.ctx, &counters);
+    CHECK(counters.tx_drops == 1 && counters.sent == 0);
+    disconnect_port();
+}
+
+/* Claimed for the buffer the kernel gives: as many frames as est_port_short_of counts on do fit. */
+static void a_second_of_frames_fits_where_it_is_said_to(void) {
+    static const int64_t periods_us[] = {1000000, 100000, 10000, 2000, 1000};
+    connect_port();
+    const struct canfd_frame frame = {.can_id = 1, .len = 8};
+    int64_t fit = 0;
+    while (io.send(io.ctx, &frame) == EST_IO_OK) {
+        fit++;
+    }
+    CHECK(state.send_buffer_bytes > 0);
+    for (size_t i = 0; i < sizeof periods_us / sizeof periods_us[0]; i++) {
+        const int64_t needed = EST_CYCLE_FRAMES_PER_JOB + 4000000 / periods_us[i];
+        CHECK(est_port_short_of(&state, periods_us[i]) > 0 || fit >= needed);
+    }
+    state.send_buffer_bytes = 212992; /* the kernel's default */
+    CHECK(est_port_short_of(&state, 100000) == 0 && est_port_short_of(&state, 1000) > 2000000);
+    disconnect_port();
+}
+
 int main(void) {
+    a_frame_the_port_refuses_is_counted_as_lost();
+    a_second_of_frames_fits_where_it_is_said_to();
     arrival_is_right_even_if_the_job_was_held_up();
     no_arrival_is_of_the_future_or_before_the_last_empty_look();
 

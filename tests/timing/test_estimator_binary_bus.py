@@ -20,7 +20,7 @@ from tests.timing.estimator_process import COUNTERS, IDENTITY, OnBus, Plant, bin
 
 OK = 2
 PR_CAPBSET_DROP = 24
-CAP_IPC_LOCK, CAP_SYS_NICE = 14, 23
+CAP_NET_ADMIN, CAP_IPC_LOCK, CAP_SYS_NICE = 12, 14, 23
 
 
 @pytest.fixture(params=["hub", pytest.param("vcan0", marks=pytest.mark.vcan)])
@@ -181,10 +181,21 @@ def test_what_is_refused_is_a_warning_and_it_runs_all_the_same(hub):
     assert (ready["policy"], ready["priority"], ready["mlock"]) == ("other", 0, False)
     assert any("SCHED_FIFO priority 80 refused" in w for w in ready["warnings"])
     assert any("mlockall refused" in w for w in ready["warnings"])
+    assert not any("send buffer" in w for w in ready["warnings"]), "at 20 ms the default holds more than a second"
     run = talk.wait(0.5).finish()
     assert run.status == 0
     check_conservation(run)
     assert run.named("EstGranted")[0].values["mlock"] == 0
+
+
+def test_a_send_buffer_too_small_for_a_second_is_a_warning(hub):
+    def without_net_admin() -> None:
+        ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_NET_ADMIN, 0, 0, 0)
+
+    limit = 2 * int(Path("/proc/sys/net/core/wmem_max").read_text())
+    talk = OnBus(hub.bus, binary("release"), "--no-rt", "--period-us", "1000", preexec_fn=without_net_admin)
+    assert any("send buffer" in w for w in talk.ready["warnings"]) == (limit < 4010 * 800)
+    assert talk.wait(0.2).finish().status == 0
 
 
 def test_core_that_does_not_exist_is_a_warning(hub):
