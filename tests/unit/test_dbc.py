@@ -42,10 +42,12 @@ CONTRACT = {
         n: (s, *U16, 1, 0, False) for n, s in (("rx_drops", 16), ("tx_drops", 32), ("rejected", 48))}),
     "EstCoreFaults": (0x4A4, "ESTIMATOR", 1000, {
         "stray_ticks": (12, 4, False, 1, 0, False),
-        **{n: (s, *U16, 1, 0, False) for n, s in (("restarts", 16), ("held_intervals", 32), ("late_measurements", 48))}}),
+        "restarts": (16, *U16, 1, 0, False), "held_intervals": (32, *U16, 1, 0, False),
+        "late_measurements": (48, *U16, 1, 0, False)}),
     "EstCoreFaults2": (0x4A5, "ESTIMATOR", 1000, {
         "repeated_ticks": (12, 4, False, 1, 0, False),
-        **{n: (s, *U16, 1, 0, False) for n, s in (("off_grid", 16), ("invalid_inputs", 32), ("unconverged", 48))}}),
+        "off_grid": (16, *U16, 1, 0, False), "invalid_inputs": (32, *U16, 1, 0, False),
+        "unconverged": (48, *U16, 1, 0, False)}),
     "TruthTemp": (0x6A0, "PLANT", 100, {
         "theta_w_true_degc": (12, 18, False, 1 / 512, -100, True),
         "theta_r_true_degc": (30, 18, False, 1 / 512, -100, True), "tick": (48, *U16, 1, 0, False)}),
