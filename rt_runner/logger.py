@@ -36,6 +36,7 @@ POLL_S = 0.05  # how long a wait for frames may hold up a control line or a flus
 DRAIN_QUIET_S, DRAIN_MAX_S = 0.2, 10.0
 DRAIN_LATER_NS = 300_000_000  # frames stamped later than this after the finish are no part of the run
 SO_MEMINFO, SK_MEMINFO_DROPS = 55, 8  # asm-generic/socket.h, linux/sock_diag.h; Python does not name them
+ORPHAN_WAIT_S = 0.5
 FINISH_WAIT_S = 10.0  # after the bus is lost: how long to wait to be told how the run ended
 _PROGRESS = ("theta_w_est_degc", "theta_w_true_degc", "resp_us")
 
@@ -209,11 +210,18 @@ class Logger:
                     self._cut_short = True
                     return
 
+    def _orphaned(self) -> bool:
+        """Whether the signal that stopped us came because the supervisor died; it may come just before it is gone."""
+        deadline = self._clock() + ORPHAN_WAIT_S
+        while os.getppid() == self._parent and self._clock() < deadline:
+            time.sleep(POLL_S)
+        return os.getppid() != self._parent
+
     def _facts(self, told: dict) -> RunFacts:
         dropped = _dropped(self._bus)
         if "finish" not in told:
             crash = told.get("why") or "the supervisor ended without finishing the run"
-            stopped_by = "crash" if os.getppid() != self._parent else told["stop"]
+            stopped_by = "crash" if told["stop"] == "crash" or self._orphaned() else told["stop"]
             return replace(
                 self._known,
                 stopped_by=stopped_by,

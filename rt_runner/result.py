@@ -263,7 +263,7 @@ class ResultAccumulator:
         dropped = max(self._lost, facts.log_dropped)  # the same frames, seen by their counters and by the kernel
         findings = [
             *self._judge_run(facts),
-            *self._judge_accuracy(accuracy, facts.limits),
+            *self._judge_accuracy(accuracy, facts),
             *self._judge_timing(facts, dropped),
             self._judge_log(dropped, facts.log_cut_short),
         ]
@@ -312,29 +312,24 @@ class ResultAccumulator:
             return [Finding("run", "inconclusive", "stopped by hand before its end")]
         return []
 
-    def _judge_accuracy(self, accuracy: dict, limits: Limits) -> list[Finding]:
+    def _judge_accuracy(self, accuracy: dict, facts: RunFacts) -> list[Finding]:
         if self._first_estimate_tick is None:
             return [Finding("accuracy", "inconclusive", "no estimate with a temperature is in the log")]
         if not self._truth.tick:
             return [Finding("accuracy", "pass", "no truth on this bus: nothing to compare with, not judged")]
+        limits, whole = facts.limits, facts.stopped_by == "end"
         out = []
         for channel, limit in (("theta_w", limits.theta_w_rmse_max_degc), ("theta_r", limits.theta_r_rmse_max_degc)):
-            rmse = accuracy[channel]["est_rmse_degc"]
+            rmse, what = accuracy[channel]["est_rmse_degc"], f"{channel} accuracy"
             if rmse is None:
-                out.append(
-                    Finding(
-                        f"{channel} accuracy",
-                        "inconclusive",
-                        f"nothing logged later than {SETTLE_S:g} s after the first estimate: run longer",
-                    )
-                )
+                says = f"nothing logged later than {SETTLE_S:g} s after the first estimate: run longer"
+                out.append(Finding(what, "inconclusive", says))
+                continue
+            says = f"RMSE {rmse:.3f} degC, limit {limit:g} degC"
+            if rmse > limit and not whole:  # the limit is one for the whole scenario
+                out.append(Finding(what, "inconclusive", f"{says}, of a part of the scenario"))
             else:
-                good = rmse <= limit
-                out.append(
-                    Finding(
-                        f"{channel} accuracy", "pass" if good else "fail", f"RMSE {rmse:.3f} degC, limit {limit:g} degC"
-                    )
-                )
+                out.append(Finding(what, "pass" if rmse <= limit else "fail", says))
         return out
 
     def _judge_timing(self, facts: RunFacts, dropped: int) -> list[Finding]:

@@ -173,6 +173,7 @@ def test_wrong_temperatures_fail():
     acc = ResultAccumulator()
     feed_run(acc, error=0.6)
     assert acc.result(facts())["verdict"] == "fail"
+    assert acc.result(facts(stopped_by="interrupt"))["verdict"] == "inconclusive"
 
 
 def test_a_gap_in_a_counter_is_a_dropped_frame_and_nothing_is_certain():
