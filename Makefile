@@ -65,7 +65,7 @@ bench: $(VENV)/.dev build
 
 train: $(VENV)/.dev
 	$(PY) -m tools.dataset --set R --seed 1 --out build/data/R.npz
-	$(PY) -m tools.train --data build/data/R.npz --lap build/data/lap.npz --out estimator_c/weights/lstm8.json
+	$(PY) -m tools.train --config tuned --data build/data/R.npz --lap build/data/lap.npz --out estimator_c/weights/lstm8.json --plot build/train-loss.svg
 
 clean:
 	rm -rf $(BUILD)

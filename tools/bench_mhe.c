@@ -59,10 +59,10 @@ int main(int argc, char **argv)
         setting.tolerance_degc = 0.0;
     }
     const int rows = (int)fread(row, sizeof row[0], MAX_ROWS, stdin);
-    const double empty[LSTM_HIDDEN] = {0};
+    const double empty[NET_MEMORY] = {0};
     double sweeps = 0.0;
     mhe_init(&mhe, &setting);
-    mhe_start(&mhe, &row[0][2], empty, empty);
+    mhe_start(&mhe, &row[0][2], empty);
     (void)estimator_init(&core, &setting);
     estimator_feed_temp(&core, 0, row[0][2], row[0][3], true, true);
     int steps = 0;

@@ -51,13 +51,13 @@ def recorded_rows(steps: int) -> np.ndarray:
     return np.ascontiguousarray(rows)
 
 
-def build(weights: Path, folder: Path) -> Path:
-    """Compile tools/bench_mhe.c with the core, -O2 as the product is."""
-    generated, base, program = compile_library(weights).parent, ROOT / "estimator_c", folder / "bench_mhe"
+def build(weights: Path, folder: Path, source: str = "bench_mhe.c") -> Path:
+    """Compile a C program of this folder with the core, -O2 as the product is."""
+    generated, base, program = compile_library(weights).parent, ROOT / "estimator_c", folder / Path(source).stem
     command = ["gcc", "-std=c11", "-D_GNU_SOURCE", "-O2", "-g", "-fno-math-errno"]
     command += [f"-I{base / 'src'}", f"-I{base / 'src' / 'solver'}", f"-I{generated}"]
-    command += [str(ROOT / "tools" / "bench_mhe.c"), *(str(base / source) for source in SOURCES)]
-    command += [str(generated / "lstm_net.c"), str(generated / "est_settings.c"), "-o", str(program), "-lm"]
+    command += [str(ROOT / "tools" / source), *(str(base / source) for source in SOURCES)]
+    command += [str(path) for path in sorted(generated.glob("*.c"))] + ["-o", str(program), "-lm"]
     subprocess.run(command, check=True)
     return program
 

@@ -1,53 +1,41 @@
-"""Build training data from the plant: data set R (recommended), P (paper protocol), and the test lap.
+"""Build training data from the plant: data set R (recommended), P (the paper's protocol), and the test lap.
 
-``python -m tools.dataset --set R --seed 1 --out build/data/R.npz`` writes the set; the lap goes beside it as
-``lap.npz``. Rows are 10-Hz intervals: mean speed and torque over the interval, temperatures at its start,
-forward-difference rates.
+``rt-runner dataset --set R --seed 1 --out build/data/R.npz``, or ``python -m tools.dataset`` with the same options,
+writes the set; the lap goes beside it as ``lap.npz``. Rows are 10-Hz intervals: mean speed and torque over the
+interval, temperatures at its start, forward-difference rates. The same seed gives the same bytes, in one go or
+interrupted: finished drives wait in ``FILE.parts`` until the set is complete.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
-import os
+import contextlib
+import io
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plant_sim.class3 import class3_trace
-from plant_sim.cycles import Cycle, CycleSpec, GradeServo
 from plant_sim.errors import PlantError
 from plant_sim.params import PlantParams, load_params
-from plant_sim.simulate import Run, simulate
-from plant_sim.track import random_track
+from tools import dataset_figures
+from tools.dataset_recipe import CYCLE_S, LAP_S, RECIPES, Chain, Kind, Recipe, drive, lap_rows
+from tools.dataset_store import DriveStore, fingerprint
+from tools.files import write_json, write_whole
+from tools.rows import COLUMNS, DataError, Rows, hash_of, rows_from
 
-CYCLE_S = 1800
-LAP_S = 720
-COLUMNS = ("n_rpm", "torque_nm", "theta_w_degc", "theta_r_degc", "dtheta_w_degc_s", "dtheta_r_degc_s")
-_SPEED_FACTORS = ((1.9, 2.4), (1.5, 1.8), (1.2, 1.4), (0.96, 1.0))
-_MASSES_KG = (0.0, 150.0, 300.0)
+__all__ = ["COLUMNS", "RECIPES", "DataSet", "Recipe", "build_lap", "build_set", "hot_share", "main", "write_npz"]
 
-
-@dataclass(frozen=True)
-class Recipe:
-    """Composition of a data set: customised road cycles, cold ones among them, and random track laps."""
-
-    cycles: int
-    cold: tuple[int, ...]
-    laps: int
-
-
-RECIPES = {"R": Recipe(cycles=6, cold=(0, 3), laps=10), "P": Recipe(cycles=10, cold=(0, 4, 7), laps=0)}
+Report = Callable[[int, int, str], None]  # finished drives, all drives, a line about the last one
 
 
 @dataclass(frozen=True, eq=False)
 class DataSet:
-    """Rows of many trajectories in order; ``trajectory`` tells which row belongs to which run."""
+    """Rows (N, 6) of many trajectories in order; ``trajectory`` tells which row belongs to which run."""
 
     values: NDArray[np.float64]
     trajectory: NDArray[np.int32]
@@ -55,9 +43,12 @@ class DataSet:
     @property
     def sha256(self) -> str:
         """Hash over the rows (little-endian float64, row by row, then the trajectory numbers)."""
-        digest = hashlib.sha256(np.ascontiguousarray(self.values, dtype="<f8").tobytes())
-        digest.update(np.ascontiguousarray(self.trajectory, dtype="<i4").tobytes())
-        return digest.hexdigest()
+        return hash_of(self.values, self.trajectory)
+
+    @property
+    def rows(self) -> Rows:
+        """The same as the trainer and the evaluation take it."""
+        return rows_from(self.values, self.trajectory)
 
     def column(self, name: str) -> NDArray[np.float64]:
         """One column by name."""
@@ -75,161 +66,150 @@ class DataSet:
         }
 
 
-def customised_cycle(rng: np.random.Generator, rotate: bool, base_seed: int) -> Cycle:
-    """Return a faster class-3-like cycle on a road whose grade keeps the winding at drawn temperatures.
-
-    Parameters
-    ----------
-    rotate
-        Begin with the extra-high phase (cold-start cycles): fast driving with a cold rotor.
-    base_seed
-        Which variant of the class-3 generator to bend.
-    """
-    trace, borders = class3_trace(base_seed)
-    phases = [trace[borders[i] + 1 : borders[i + 1] + 1] * rng.uniform(*_SPEED_FACTORS[i]) for i in range(4)]
-    v = np.concatenate([[0.0], *([phases[3], *phases[:3]] if rotate else phases)])
-    v = np.minimum(v, 130.0 / 3.6)
-    target, dither = np.empty(CYCLE_S + 1), np.empty(CYCLE_S + 1)
-    for out, draw, hold in ((target, _draw_target, (90.0, 240.0)), (dither, _draw_dither, (8.0, 40.0))):
-        at = 0
-        while at <= CYCLE_S:
-            end = at + round(rng.uniform(*hold))
-            out[at:end] = draw(rng)
-            at = end
-    return Cycle(f"custom-{base_seed}", False, 1.0, v, np.zeros_like(v), GradeServo(target, dither))
-
-
-def _draw_target(rng: np.random.Generator) -> float:
-    """Winding target in degC; mostly the derating region, where accuracy matters."""
-    low, high = ((152.0, 160.0), (125.0, 152.0), (85.0, 125.0), (160.0, 170.0))[
-        rng.choice(4, p=(0.72, 0.14, 0.08, 0.06))
-    ]
-    return rng.uniform(low, high)
-
-
-def _draw_dither(rng: np.random.Generator) -> float:
-    return rng.normal(0.0, 0.02)
-
-
-def road_runs(params: PlantParams, recipe: Recipe, seed: int) -> Iterator[Run]:
-    """Drive the customised cycles in a row; only the cold ones restart from a uniform temperature."""
-    rng = np.random.default_rng([seed, 1])
-    theta: float | NDArray[np.float64] = 60.0
-    for k in range(recipe.cycles):
-        cold = k in recipe.cold
-        if cold:
-            theta = float(rng.choice([40.0, 60.0]))
-        mass = float(rng.choice(_MASSES_KG))
-        heavy = params.varied(vehicle__mass_kg=params.vehicle.mass_kg + mass)
-        run = simulate(
-            heavy, customised_cycle(rng, cold, base_seed=100 * seed + k), CYCLE_S, theta0_degc=theta
-        )
-        theta = run.theta_end_degc
-        yield run
-
-
-def track_runs(params: PlantParams, recipe: Recipe, seed: int) -> Iterator[Run]:
-    """Drive random mountain laps, cut to equal length.
-
-    Every third lap is calmer, every second one derated linearly from 150 degC, every fourth starts anew at
-    U(25, 70) degC.
-    """
-    rng = np.random.default_rng([seed, 2])
-    theta: float | NDArray[np.float64] = 60.0
-    for k in range(recipe.laps):
-        if k % 4 == 0:
-            theta = float(rng.uniform(25.0, 70.0))
-        factor = float(rng.uniform(0.85, 1.0)) if k % 3 == 2 else 1.0
-        rule = (150.0, float(rng.uniform(156.0, 165.0))) if k % 2 == 1 else (0.0, 0.0)
-        track = random_track(params, rng, length_m=29000.0, speed_factor=factor, name=f"track-{seed}-{k}")
-        run = simulate(params, track, LAP_S, theta0_degc=theta, rule_degc=rule)
-        theta = run.theta_end_degc
-        yield run
-
-
-def build_set(params: PlantParams, name: str, seed: int, progress=lambda text: None) -> DataSet:
-    """Build data set R or P; the same seed gives the same rows.
+def build_set(
+    params: PlantParams,
+    name: str,
+    seed: int,
+    report: Report = lambda done, of, text: None,
+    store: DriveStore | None = None,
+) -> DataSet:
+    """Build data set R or P; the same seed gives the same rows, with or without a store to go on from.
 
     Raises
     ------
     PlantError
-        If a run ended early or produced a value that is not finite.
+        If a drive ended early or produced a value that is not finite.
     """
     recipe = RECIPES[name]
-    blocks, labels = [], []
-    for runs, length_s in (
-        (road_runs(params, recipe, seed), CYCLE_S),
-        (track_runs(params, recipe, seed), LAP_S),
-    ):
-        for run in runs:
-            block = rows_of(run)
-            if block.shape[0] != length_s * 10 or not np.isfinite(block).all():
-                raise PlantError(
-                    f"data set {name}, trajectory {len(blocks)}: {block.shape[0]} rows instead of "
-                    f"{length_s * 10}, or not finite; change the seed and report the defect"
-                )
-            labels.append(np.full(block.shape[0], len(blocks), dtype=np.int32))
-            blocks.append(block)
-            progress(
-                f"{name}: trajectory {len(blocks)}/{recipe.cycles + recipe.laps}, {block.shape[0]} rows, "
-                f"winding {block[:, 2].min():.0f}..{block[:, 2].max():.0f} degC"
-            )
+    blocks: list[NDArray[np.float64]] = []
+    chains: dict[Kind, Chain] = {}
+    fresh: set[Kind] = set()  # kinds with a drive simulated now: what the store holds after it is not its successor
+    for number, (kind, k) in enumerate(recipe.drives):
+        kept = store.load(number) if store is not None and kind not in fresh else None
+        if kept is None:
+            fresh.add(kind)
+            before = chains[kind] if k > 0 else Chain.begin(kind, seed)
+            rows, chains[kind] = drive(params, recipe, seed, kind, k, before)
+            _check(rows, f"data set {name}, seed {seed}, trajectory {number}", CYCLE_S if kind == "road" else LAP_S)
+            if store is not None:
+                store.save(number, rows, chains[kind])
+        else:
+            rows, chains[kind] = kept
+        blocks.append(rows)
+        verb = "kept" if kept is not None else "driven"
+        theta = rows[:, COLUMNS.index("theta_w_degc")]
+        report(
+            number + 1,
+            len(recipe.drives),
+            f"{kind} {k + 1}, {rows.shape[0]} rows {verb}, winding {theta.min():.0f}..{theta.max():.0f} °C",
+        )
+    labels = [np.full(len(rows), i, dtype=np.int32) for i, rows in enumerate(blocks)]
     return DataSet(np.concatenate(blocks), np.concatenate(labels))
 
 
+def _check(rows: NDArray[np.float64], what: str, duration_s: int) -> None:
+    if rows.shape[0] != duration_s * 10 or not np.isfinite(rows).all():
+        raise PlantError(
+            f"{what}: {rows.shape[0]} rows instead of {duration_s * 10}, or not finite; change the seed and "
+            f"report the defect"
+        )
+
+
 def build_lap(params: PlantParams) -> DataSet:
-    """Drive the synthetic test lap, underated, from 60 degC; never part of a training set."""
-    block = rows_of(simulate(params, CycleSpec("lap", theta0_degc=60.0)))
+    """Drive the synthetic test lap, underated, from 60 °C; never part of a training set."""
+    block = lap_rows(params)
     return DataSet(block, np.zeros(block.shape[0], dtype=np.int32))
 
 
-def rows_of(run: Run) -> NDArray[np.float64]:
-    """Rows (n, 6) of a run in the order of COLUMNS."""
-    return np.stack([getattr(run, name) for name in COLUMNS], axis=1)
-
-
 def hot_share(data: DataSet) -> float:
-    """Share of rows with the winding at 150..160 degC."""
-    theta = data.column("theta_w_degc")
-    return float(np.mean((theta >= 150.0) & (theta <= 160.0)))
+    """Share of rows with the winding at 150..160 °C."""
+    return dataset_figures.hot_share(data.column("theta_w_degc"))
 
 
 def write_npz(path: Path, data: DataSet) -> None:
-    """Write a data set so that a reader never sees half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
-    with part.open("wb") as file:
-        np.savez(file, **data.arrays())
-    os.replace(part, path)
+    """Write a data set so that a reader never sees half a file; the same rows give the same bytes."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **data.arrays())
+    write_whole(path, buffer.getvalue())
+
+
+@contextlib.contextmanager
+def progress(title: str, stream: TextIO) -> Iterator[Report]:
+    """A bar on a terminal, a line per drive elsewhere."""
+    if not stream.isatty():
+        yield lambda done, of, text: print(f"{title}: {done}/{of}, {text}", file=stream, flush=True)
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, TextColumn("{task.fields[text]}"), console=Console(file=stream)) as bar:
+        task = bar.add_task(title, total=None, text="")
+        yield lambda done, of, text: bar.update(task, completed=done, total=of, text=text)
+
+
+def parse(argv: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="rt-runner dataset", description="Build a training data set and the test lap from the plant."
+    )
+    add_options(parser)
+    return parser.parse_args(argv)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("--set", choices=sorted(RECIPES), default="R", help="R: cycles, tracks; P: hot cycles; R-hot")
+    parser.add_argument("--seed", type=int, default=1, help="default %(default)s")
+    parser.add_argument("--out", type=Path, help="file to write; lap.npz goes beside it (default: build/data/SET.npz)")
+    parser.add_argument("--json", metavar="FILE", help="write the figures as JSON (-: standard output)")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="histograms of both rates, .svg or .png")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line entry."""
-    parser = argparse.ArgumentParser(description="Build a training data set and the test lap from the plant.")
-    parser.add_argument(
-        "--set", choices=sorted(RECIPES), default="R", help="R: cycles and tracks; P: cycles only"
-    )
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, required=True, help="file to write; lap.npz goes beside it")
-    args = parser.parse_args(argv)
+    args = parse(argv)
+    out: Path = args.out or Path("build") / "data" / f"{args.set}.npz"
+    parts = out.with_name(f"{out.name}.parts")
+    shown = sys.stderr if args.json == "-" else sys.stdout
     try:
+        if args.seed < 0:
+            raise DataError(f"--seed {args.seed}: give a whole number from 0 on")
+        if args.plot is not None:
+            from tools.plots import check_plot
+
+            check_plot(args.plot)
         params = load_params()
-        data = build_set(params, args.set, args.seed, lambda text: print(text, flush=True))
-        write_npz(args.out, data)
+        with DriveStore(parts, fingerprint(params, RECIPES[args.set], args.seed)) as store:
+            with progress(f"set {args.set}, seed {args.seed}", shown) as report:
+                data = build_set(params, args.set, args.seed, report, store)
+            write_npz(out, data)
+            store.remove()
         lap = build_lap(params)
-        write_npz(args.out.with_name("lap.npz"), lap)
-    except (PlantError, OSError) as error:
+        write_npz(out.with_name("lap.npz"), lap)
+        figures = {"set": args.set, "seed": args.seed, "file": str(out), **dataset_figures.describe(data.rows)}
+        if args.plot is not None:
+            from tools.plots import plot_dataset
+
+            plot_dataset(args.plot, data.rows, f"data set {args.set}, seed {args.seed}")
+        write_json(args.json, figures)
+    except (PlantError, DataError) as error:
         print(f"dataset: {error}", file=sys.stderr)
         return 1
-    print(
-        f"{args.out}: {data.values.shape[0]} rows, {hot_share(data):.1%} at 150..160 degC, "
-        f"sha256 {data.sha256}"
-    )
-    print(
-        f"{args.out.with_name('lap.npz')}: {lap.values.shape[0]} rows, "
-        f"winding max {lap.column('theta_w_degc').max():.1f} "
-        f"degC, sha256 {lap.sha256}"
-    )
+    except OSError as error:
+        print(f"dataset: {error.filename or out}: {error.strerror}; make room or choose another --out", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"dataset: stopped; what is finished waits in {parts}: the same command goes on from it", file=sys.stderr)
+        return 130
+    print(dataset_figures.table(figures), file=shown)
+    print(file=shown)
+    for path, of in ((out, data), (out.with_name("lap.npz"), lap)):
+        theta = of.column("theta_w_degc")
+        print(
+            f"{path}: {len(of.values)} rows, {hot_share(of):.1%} at 150..160 °C, winding max {theta.max():.1f} °C, "
+            f"sha256 {of.sha256}",
+            file=shown,
+        )
     return 0
 
 

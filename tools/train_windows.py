@@ -9,30 +9,9 @@ import torch
 
 from tools.evaluate import Rows
 from tools.lstm_torch import LstmRates, Scaling
+from tools.train_configs import Settings
 
-
-@dataclass(frozen=True)
-class Settings:
-    """What a training run depends on, beside its data; written into the weights file."""
-
-    hidden: int = 8
-    seed: int = 1
-    fold: int = 1  # which fifth of the trajectories is held out, 0..4
-    epochs: int = 3000
-    lr: float = 0.02
-    lr_end: float = 2e-5
-    batch: int = 12
-    window_s: float = 160.0
-    start_share: float = 0.05  # of the windows begin where a trajectory does: few rows, but every drive has them
-    early_weight: float = 0.1  # of a window's first row in the loss: the memory is still empty there
-    early_s: float = 30.0  # ... growing to 1 over this time
-    theta_noise_degc: float = 0.1  # slow noise on the temperature inputs, as from an estimator
-    theta_noise_s: float = 5.0  # its correlation time
-    rotor_weight: float = 1.0  # of the rotor's normalised squared error beside the winding's
-    clip: float = 1.0
-    l2: float = 0.0
-    dt_s: float = 0.1
-    validate_every: int = 20
+__all__ = ["FixedSequences", "Settings", "Split", "Validation", "Windows", "loss_of", "row_weights", "split"]
 
 
 @dataclass(frozen=True)
@@ -76,6 +55,15 @@ def loss_of(error: torch.Tensor, weights: torch.Tensor, rotor_weight: float) -> 
     return (weights * error.new_tensor([1.0, rotor_weight]) * error.square()).mean()
 
 
+def integral_loss_of(error: torch.Tensor, weights: torch.Tensor, s: Settings) -> torch.Tensor:
+    """Weighted mean square of what the rate errors add up to from the window's first row on, over its length.
+
+    The error in temperature at the window's end, as a mean rate; what the memory could not know yet does not count.
+    """
+    added = (weights * error).cumsum(0) / len(error)
+    return (error.new_tensor([1.0, s.rotor_weight]) * added.square()).mean()
+
+
 class Windows:
     """Random windows of the training pieces, scaled, as float32 tensors of shape (rows, batch, channels)."""
 
@@ -89,9 +77,14 @@ class Windows:
         self.rows_in_all = sum(len(p) for p in pieces)
         self.s = s
         self.noise_scale = torch.tensor(s.theta_noise_degc / scaling.in_scale[2:], dtype=torch.float32)
+        self.weights = row_weights(self.length, s)
 
     def batches_per_epoch(self) -> int:
         return max(1, round(self.rows_in_all / (self.s.batch * self.length)))
+
+    def batch(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Scaled inputs and rates of the next mini-batch, and the weights of its rows in the loss."""
+        return *self.draw(), self.weights
 
     def draw(self) -> tuple[torch.Tensor, torch.Tensor]:
         first = self.rng.choice(self.starts, self.s.batch)
@@ -111,6 +104,36 @@ class Windows:
         left = np.minimum(position.astype(int), len(knots) - 2)
         part = (position - left).astype(np.float32)[:, None, None]
         return torch.from_numpy((1.0 - part) * knots[left] + part * knots[left + 1])
+
+
+class FixedSequences(Windows):
+    """The training pieces cut once into equal sequences of at most a window, taken in order, as in Algorithm 1.
+
+    Sequences shorter than the longest repeat their last row to its length; such rows do not count in the loss.
+    """
+
+    def __init__(self, rows: Rows, pieces: list[np.ndarray], scaling: Scaling, s: Settings) -> None:
+        super().__init__(rows, pieces, scaling, s)
+        most = round(s.window_s / s.dt_s)
+        cuts = [part for p in pieces for part in np.array_split(p, -(-len(p) // most))]
+        self.length = max(len(cut) for cut in cuts)
+        padded = [np.concatenate((cut, np.full(self.length - len(cut), cut[-1]))) for cut in cuts]
+        self.at = torch.from_numpy(np.stack(padded, axis=1))
+        lengths = torch.tensor([len(cut) for cut in cuts])
+        self.counts = (torch.arange(self.length)[:, None] < lengths)[:, :, None] * row_weights(self.length, s)
+        self.next = 0
+
+    def batches_per_epoch(self) -> int:
+        return -(-self.at.shape[1] // self.s.batch)
+
+    def batch(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        part = slice(self.next * self.s.batch, (self.next + 1) * self.s.batch)
+        self.next = (self.next + 1) % self.batches_per_epoch()
+        at, counts = self.at[:, part], self.counts[:, part]
+        u, y = self.u[at], self.y[at]
+        if self.s.theta_noise_degc > 0:
+            u[:, :, 2:] += self.noise_scale * self.slow_noise()[:, : u.shape[1]]
+        return u, y, counts * (counts.numel() / counts.count_nonzero())
 
 
 @dataclass(frozen=True)

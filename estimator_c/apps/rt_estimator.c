@@ -14,7 +14,7 @@
 #include "est_lockstep.h"
 #include "est_port.h"
 #include "est_report.h"
-#include "lstm_net.h"
+#include "thermal_net.h"
 #include "rt_clock.h"
 #include "rt_grant.h"
 
@@ -173,7 +173,7 @@ static void catch_signals(const options *opt) {
 static est_identity identity_of(const options *opt, const rt_granted *granted) {
     const est_identity identity = {
         .dbc_hash = DRIVE_DBC_HASH24,
-        .weights_hash = lstm_weights_hash24,
+        .weights_hash = net_weights_hash24,
         .build_hash = BUILD_HASH24,
         .setting_id = (uint8_t)opt->setting->id,
         .policy = (uint8_t)granted->policy,
@@ -202,7 +202,7 @@ static est_cycle_status set_up(const options *opt, const est_io *io, const rt_gr
 }
 
 static void report_ready(FILE *out, const options *opt, const rt_granted *granted) {
-    const est_report_identity identity = {opt->setting->name, lstm_weights_sha256, DRIVE_DBC_SHA256,
+    const est_report_identity identity = {opt->setting->name, net_weights_sha256, DRIVE_DBC_SHA256,
                                           BUILD_SHA256,       opt->period_us,      granted};
     est_report_ready(out, &identity);
 }

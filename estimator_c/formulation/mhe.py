@@ -18,8 +18,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from .lstm import build_lstm
-from .weights import LstmWeights
+from .net import build_net
+from .weights import NetWeights
 
 Array = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ class MheProblem:
         Measurements (offset removed, degC) and their weights in 1/K²; weight 0 = no measurement.
     prior, weight_arrival, weight_noise : (2,)
         theta bar of node 0 and its weight, weight of the process noise per stage, 1/K².
-    c, h : (H,)
+    memory : (M,)
         Memory of the net at node 0, fixed.
     lower, upper : float
         Bounds on all temperatures, degC.
@@ -66,8 +66,7 @@ class MheProblem:
     prior: Array
     weight_arrival: Array
     weight_noise: Array
-    c: Array
-    h: Array
+    memory: Array
     lower: float = -np.inf
     upper: float = np.inf
     bound_weight: float | None = None
@@ -76,7 +75,7 @@ class MheProblem:
 class MheOracle:
     """ipopt on the problem, to about 1e-9 degC; builds one NLP per number of nodes and statement."""
 
-    def __init__(self, weights: LstmWeights, statement: str = "theta") -> None:
+    def __init__(self, weights: NetWeights, statement: str = "theta") -> None:
         if statement not in ("theta", "shooting"):
             raise ValueError(f"statement must be 'theta' or 'shooting', is {statement!r}")
         self.weights, self.statement = weights, statement
@@ -100,8 +99,8 @@ class MheOracle:
         return np.array(out["x"][: 2 * nodes]).reshape(nodes, 2)
 
     def _build(self, nodes: int, soft: bool) -> ca.Function:
-        n_h, dt_s = self.weights.hidden, self.weights.dt_s
-        net = build_lstm(self.weights).forward
+        n_m, dt_s = self.weights.memory, self.weights.dt_s
+        net = build_net(self.weights).forward
         theta = ca.SX.sym("theta", 2, nodes)
         p: dict[str, Any] = {
             "u": ca.SX.sym("u", 2, nodes - 1),
@@ -110,25 +109,24 @@ class MheOracle:
             "prior": ca.SX.sym("prior", 2),
             "p0": ca.SX.sym("p0", 2),
             "ww": ca.SX.sym("ww", 2),
-            "c": ca.SX.sym("c", n_h),
-            "h": ca.SX.sym("h", n_h),
+            "memory": ca.SX.sym("memory", n_m),
             "bounds": ca.SX.sym("bounds", 3),
         }
         unknowns, constraints = [ca.vec(theta)], []
         cost = 0.5 * ca.dot(p["p0"], (theta[:, 0] - p["prior"]) ** 2)
         cost += 0.5 * ca.dot(p["weight"], (theta - p["y"]) ** 2)
-        c, h = p["c"], p["h"]
+        memory = p["memory"]
         for k in range(nodes - 1):
-            c_next, h_next, rate, _ = net(p["u"][:, k], theta[:, k], c, h)
+            memory_next, rate, _ = net(p["u"][:, k], theta[:, k], memory)
             w = theta[:, k + 1] - theta[:, k] - dt_s * rate
             if self.statement == "shooting":
                 w_k = ca.SX.sym(f"w_{k}", 2)
-                c, h = ca.SX.sym(f"c_{k + 1}", n_h), ca.SX.sym(f"h_{k + 1}", n_h)
-                unknowns += [w_k, c, h]
-                constraints += [w - w_k, c - c_next, h - h_next]
+                memory = ca.SX.sym(f"memory_{k + 1}", n_m)
+                unknowns += [w_k, memory]
+                constraints += [w - w_k, memory - memory_next]
                 w = w_k
             else:
-                c, h = c_next, h_next
+                memory = memory_next
             cost += 0.5 * ca.dot(p["ww"], w**2)
         if soft:
             over, under = ca.SX.sym("over", 2 * nodes), ca.SX.sym("under", 2 * nodes)
@@ -145,12 +143,12 @@ class MheOracle:
         return ca.nlpsol("mhe_oracle", "ipopt", nlp, IPOPT)
 
     def _start(self, problem: MheProblem, theta: Array) -> Array:
-        net = build_lstm(self.weights).forward
-        parts, c, h = [np.asarray(theta).ravel()], problem.c, problem.h
+        net = build_net(self.weights).forward
+        parts, memory = [np.asarray(theta).ravel()], problem.memory
         if self.statement == "shooting":
             for k in range(len(problem.u)):
-                c, h = (np.array(value).ravel() for value in net(problem.u[k], theta[k], c, h)[:2])
-                parts += [np.zeros(2), c, h]
+                memory = np.array(net(problem.u[k], theta[k], memory)[0]).ravel()
+                parts += [np.zeros(2), memory]
         if problem.bound_weight is not None:
             flat = np.asarray(theta).ravel()
             parts += [np.maximum(flat - problem.upper, 0.0) + 1e-3, np.maximum(problem.lower - flat, 0.0) + 1e-3]
@@ -172,6 +170,6 @@ def _parameters(problem: MheProblem) -> Array:
     )
     parts = (
         problem.u, problem.y, problem.weight, problem.prior, problem.weight_arrival, problem.weight_noise,
-        problem.c, problem.h, bounds,
+        problem.memory, bounds,
     )  # fmt: skip
     return np.concatenate([np.asarray(part, dtype=np.float64).ravel() for part in parts])

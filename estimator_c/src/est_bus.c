@@ -157,6 +157,21 @@ void est_bus_innov(est_bus *self, const est_output *in, struct canfd_frame *fram
     SEAL(self, DRIVE_INDEX_ESTIMATE_INNOV, estimate_innov, raw, frame);
 }
 
+void est_bus_validity(est_bus *self, const est_output *in, struct canfd_frame *frame) {
+    const validity_result_t *validity = &in->validity;
+    struct drive_est_validity_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.outside_speed = validity->outside_speed ? 1U : 0U;
+    raw.outside_torque = validity->outside_torque ? 1U : 0U;
+    raw.outside_theta_w = validity->outside_theta_w ? 1U : 0U;
+    raw.outside_theta_r = validity->outside_theta_r ? 1U : 0U;
+    raw.outside_joint = validity->outside_joint ? 1U : 0U;
+    raw.scope = drive_est_validity_scope_to_raw((double)validity->scope);
+    raw.novelty = drive_est_validity_novelty_to_raw(validity->novelty);
+    raw.tick = in->tick;
+    SEAL(self, DRIVE_INDEX_EST_VALIDITY, est_validity, raw, frame);
+}
+
 void est_bus_timing_a(est_bus *self, const est_timing *in, struct canfd_frame *frame) {
     struct drive_est_timing_a_t raw;
     memset(&raw, 0, sizeof raw);

@@ -16,6 +16,7 @@
 #include "drive_e2e.h"
 #include "e2e.h"
 #include "rt_stats.h"
+#include "validity.h"
 
 /* The messages the estimator listens to. */
 typedef enum { EST_RX_MOTOR_STATE = 0, EST_RX_TEMP_MEAS = 1, EST_RX_COUNT = 2 } est_rx_id;
@@ -81,6 +82,7 @@ typedef struct {
     double theta_r_degc;
     double innov_w_degc;
     double innov_r_degc;
+    validity_result_t validity;
 } est_output;
 
 typedef struct {
@@ -138,6 +140,7 @@ void est_bus_read_faults(const est_bus *self, est_bus_faults *out);
  * Each takes well under 1 µs and cannot fail. */
 void est_bus_estimate(est_bus *self, const est_output *in, struct canfd_frame *frame);
 void est_bus_innov(est_bus *self, const est_output *in, struct canfd_frame *frame);
+void est_bus_validity(est_bus *self, const est_output *in, struct canfd_frame *frame);
 void est_bus_timing_a(est_bus *self, const est_timing *in, struct canfd_frame *frame);
 void est_bus_timing_b(est_bus *self, const est_timing *in, struct canfd_frame *frame);
 

@@ -4,7 +4,7 @@
 #include <string.h>
 
 _Static_assert(sizeof(est_cycle) <= 600000, "est_cycle.h says so");
-_Static_assert((int)EST_CYCLE_FRAMES_PER_JOB <= 10, "txqueuelen of a CAN interface: more at once would be lost");
+_Static_assert((int)EST_CYCLE_FRAMES_PER_JOB <= 11, "send queue of a CAN interface and its controller: more would be lost");
 
 static const int64_t NS_PER_S = 1000000000;
 static const int64_t IDENTITY_EVERY_S = 10;
@@ -93,6 +93,7 @@ static est_output output_of(const estimator_out_t *out, bool motor_stale) {
         .theta_r_degc = out->theta_r_degc,
         .innov_w_degc = out->innov_w_degc,
         .innov_r_degc = out->innov_r_degc,
+        .validity = out->validity,
     };
     return output;
 }
@@ -118,8 +119,10 @@ static est_cycle_status publish(est_cycle *self, const est_output *output, bool 
     if (status == EST_IO_GONE) {
         return EST_CYCLE_GONE;
     }
-    est_bus_innov(&self->bus, output, &frame);
-    return send_all(self, &frame, 1);
+    struct canfd_frame more[2];
+    est_bus_innov(&self->bus, output, &more[0]);
+    est_bus_validity(&self->bus, output, &more[1]);
+    return send_all(self, more, 2);
 }
 
 static est_cycle_status publish_timing(est_cycle *self, const rt_job *job, bool stale) {

@@ -2,9 +2,10 @@
  *
  *     frames → est_bus (E2E, decode) → estimator → est_bus (encode, E2E) → frames
  *
- * Frames leave in this order: Estimate, EstimateInnov, then (response time known) EstTimingA, EstTimingB; once a second
- * of release time the six counter frames; with the first job and every ten seconds the three identity frames, but never in
- * one job with the counters: at most ten frames leave together (EST_CYCLE_FRAMES_PER_JOB), the send queue of a CAN interface.
+ * Frames leave in this order: Estimate, EstimateInnov, EstValidity, then (response time known) EstTimingA, EstTimingB;
+ * once a second of release time the six counter frames; with the first job and every ten seconds the three identity
+ * frames, but never in one job with the counters: at most eleven frames leave together (EST_CYCLE_FRAMES_PER_JOB), what
+ * the send queue of a CAN interface (10) and its controller (1) take.
  * No allocation, no lock, no printing. One thread; the caller owns the object. */
 #ifndef EST_CYCLE_H
 #define EST_CYCLE_H
@@ -19,7 +20,7 @@
 
 enum { EST_CYCLE_MAX_FRAMES = 4096 }; /* frames one job reads at most; the rest waits for the next job */
 
-enum { EST_CYCLE_FRAMES_PER_JOB = 4 + EST_COUNTER_FRAMES }; /* most that one job sends */
+enum { EST_CYCLE_FRAMES_PER_JOB = 5 + EST_COUNTER_FRAMES }; /* most that one job sends */
 
 typedef enum {
     EST_CYCLE_OK = 0,

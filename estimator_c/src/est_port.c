@@ -101,7 +101,7 @@ est_io est_port_io(est_port *self, can_port_t *port) {
 }
 
 int est_port_short_of(const est_port *self, int64_t period_us) {
-    const int64_t frames = EST_CYCLE_FRAMES_PER_JOB + 4 * INT64_C(1000000) / period_us;
+    const int64_t frames = EST_CYCLE_FRAMES_PER_JOB + 5 * INT64_C(1000000) / period_us;
     const int64_t lacking = frames * QUEUED_FRAME_BYTES - self->send_buffer_bytes;
     return self->send_buffer_bytes > 0 && lacking > 0 ? (int)lacking : 0;
 }

@@ -36,6 +36,7 @@ static void forget(estimator_t *self)
     self->counters = counters;
     self->invalid_pending = invalid_pending;
     mhe_init(&self->mhe, &self->setting);
+    validity_init(&self->validity);
     for (int k = 0; k < ESTIMATOR_RING; k++) {
         self->measured[k][0] = NAN;
         self->measured[k][1] = NAN;
@@ -262,16 +263,15 @@ static bool start_at(estimator_t *self, int64_t k)
             fall_back(self, ch);
         }
     }
-    double c[LSTM_HIDDEN] = {0};
-    double h[LSTM_HIDDEN] = {0};
+    double memory[NET_MEMORY] = {0};
     double rate[MHE_CHANNELS];
-    double tape[LSTM_TAPE];
+    double tape[NET_TAPE];
     /* With delay 0 the interval after node k is not known yet; the one before it is the nearest there is. */
     const int64_t first = self->setting.delay_steps > 0 ? k : k - 1;
     for (int step = 0; step < self->setting.spin_up_steps && first >= 0; step++) {
-        lstm_forward(self->input[slot(first)], prior, c, h, c, h, rate, tape);
+        net_forward(self->input[slot(first)], prior, memory, memory, rate, tape);
     }
-    mhe_start(&self->mhe, prior, c, h);
+    mhe_start(&self->mhe, prior, memory);
     self->started = true;
     return true;
 }
@@ -311,7 +311,7 @@ static void solve(estimator_t *self, int64_t now, estimator_out_t *out)
     const mhe_status_t status = mhe_solve(&self->mhe, &result);
     const mhe_node_t *node = mhe_node(&self->mhe, 0);
     double rate[MHE_CHANNELS];
-    double tape[LSTM_TAPE];
+    double tape[NET_TAPE];
     double sum = 0.0;
 
     self->measurement_pending = false;
@@ -319,12 +319,11 @@ static void solve(estimator_t *self, int64_t now, estimator_out_t *out)
     out->sweeps = result.sweeps > out->sweeps ? result.sweeps : out->sweeps;
     out->kkt_degc = result.kkt_degc;
     memcpy(self->theta, node->theta, sizeof self->theta);
-    memcpy(self->c, node->c, sizeof self->c);
-    memcpy(self->h, node->h, sizeof self->h);
+    memcpy(self->memory, node->memory, sizeof self->memory);
     for (int64_t k = now - self->setting.delay_steps; k < now; k++) {
-        lstm_forward(self->input[slot(k)], self->theta, self->c, self->h, self->c, self->h, rate, tape);
+        net_forward(self->input[slot(k)], self->theta, self->memory, self->memory, rate, tape);
         for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-            self->theta[ch] += LSTM_DT_S * rate[ch];
+            self->theta[ch] += NET_DT_S * rate[ch];
         }
     }
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
@@ -343,6 +342,9 @@ static void consume_interval(estimator_t *self, estimator_out_t *out)
     close_interval(self, k, &out->stale_input);
     self->next_interval = k + 1;
     out->intervals++;
+    if (self->started) {
+        validity_step(&self->validity, self->input[slot(k)], self->theta); /* as the net is fed for interval k */
+    }
 
     const int64_t node = k + 1 - self->setting.delay_steps;
     if (!self->started) {
@@ -368,15 +370,14 @@ static void publish_theta(const estimator_t *self, estimator_out_t *out)
     if (since > 0) {
         const estimator_bin_t *bin = &self->bin[slot(self->next_interval)];
         double input[2] = {self->held_input[0], self->held_input[1]};
-        double c[LSTM_HIDDEN];
-        double h[LSTM_HIDDEN];
+        double memory[NET_MEMORY];
         double rate[MHE_CHANNELS];
-        double tape[LSTM_TAPE];
+        double tape[NET_TAPE];
         if (bin->frames > 0) {
             input[0] = bin->speed_sum / bin->frames;
             input[1] = bin->torque_sum / bin->frames;
         }
-        lstm_forward(input, theta, self->c, self->h, c, h, rate, tape);
+        net_forward(input, theta, self->memory, memory, rate, tape);
         for (int ch = 0; ch < MHE_CHANNELS; ch++) {
             theta[ch] += rate[ch] * ESTIMATOR_TICK_S * (double)since;
         }
@@ -421,6 +422,7 @@ void estimator_step(estimator_t *self, estimator_out_t *out)
     out->status = self->invalid_pending ? ESTIMATOR_INVALID : status_now(self);
     self->invalid_pending = false;
     out->stale_input |= out->status == ESTIMATOR_INPUT_STALE;
+    out->validity = self->validity.result;
     out->innov_w_degc = self->innovation[0];
     out->innov_r_degc = self->innovation[1];
     self->innovation[0] = NAN;

@@ -15,6 +15,7 @@
 #include <stdint.h>
 
 #include "mhe.h"
+#include "validity.h"
 
 #define ESTIMATOR_RING 128          /* intervals remembered; a power of two */
 #define ESTIMATOR_TICKS 10          /* motor ticks per interval */
@@ -57,6 +58,7 @@ typedef struct {
     int32_t intervals;                 /* intervals consumed in this step */
     int32_t sweeps;                    /* most sweeps of any MHE solution in this step, 0: none was computed */
     double kkt_degc;                   /* of the last MHE solution in this step, see mhe.h; NAN: none */
+    validity_result_t validity;        /* of the newest interval's input to the net */
 } estimator_out_t;
 
 typedef struct {
@@ -93,7 +95,8 @@ typedef struct {
 
     /* Solution at the newest grid node. */
     double theta[MHE_CHANNELS];
-    double c[LSTM_HIDDEN], h[LSTM_HIDDEN];
+    double memory[NET_MEMORY];
+    validity_t validity;
     double innovation[MHE_CHANNELS];   /* not yet published */
     bool measurement_pending;          /* a late measurement entered the window after its step */
     bool invalid_pending;              /* the next output says ESTIMATOR_INVALID */

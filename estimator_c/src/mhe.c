@@ -39,15 +39,14 @@ void mhe_init(mhe_t *self, const est_setting_t *setting)
     self->newest_measurement = setting->newest_measurement;
 }
 
-void mhe_start(mhe_t *self, const double prior[MHE_CHANNELS], const double c[], const double h[])
+void mhe_start(mhe_t *self, const double prior[MHE_CHANNELS], const double memory[])
 {
     self->head = 0;
     self->count = 1;
     self->full = false;
     mhe_node_t *node = at(self, 0);
     memset(node, 0, sizeof *node);
-    memcpy(node->c, c, sizeof node->c);
-    memcpy(node->h, h, sizeof node->h);
+    memcpy(node->memory, memory, sizeof node->memory);
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         node->theta[ch] = prior[ch];
         self->prior[ch] = prior[ch];
@@ -59,7 +58,7 @@ static void stage_forward(mhe_t *self, int k)
 {
     mhe_node_t *from = at(self, k);
     mhe_node_t *to = at(self, k + 1);
-    lstm_forward(from->u, from->theta, from->c, from->h, to->c, to->h, from->rate, from->tape);
+    net_forward(from->u, from->theta, from->memory, to->memory, from->rate, from->tape);
 }
 
 /* 1 + dt dF/dtheta enters the matrix only, so it is taken once, when the stage is new. Kept positive so that the
@@ -68,9 +67,9 @@ static void stage_slope(mhe_t *self, int k)
 {
     mhe_node_t *from = at(self, k);
     double slope[MHE_CHANNELS];
-    lstm_slope(from->tape, from->c, slope);
+    net_slope(from->tape, from->memory, slope);
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-        from->slope[ch] = fmax(0.1, 1.0 + LSTM_DT_S * slope[ch]);
+        from->slope[ch] = fmax(0.1, 1.0 + NET_DT_S * slope[ch]);
     }
 }
 
@@ -89,7 +88,7 @@ void mhe_advance(mhe_t *self, const double u[2])
     stage_forward(self, self->count - 2);
     stage_slope(self, self->count - 2);
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-        to->theta[ch] = from->theta[ch] + LSTM_DT_S * from->rate[ch];
+        to->theta[ch] = from->theta[ch] + NET_DT_S * from->rate[ch];
         to->y[ch] = 0.0;
         to->weight[ch] = 0.0;
     }
@@ -125,8 +124,7 @@ static void forward_sweep(mhe_t *self)
 static void adjoint_sweep(mhe_t *self)
 {
     const double *p0 = arrival_weight(self);
-    double c_bar[LSTM_HIDDEN] = {0};
-    double h_bar[LSTM_HIDDEN] = {0};
+    double memory_bar[NET_MEMORY] = {0};
     double pull[MHE_CHANNELS] = {0}; /* Ww w of the stage that leaves node k + 1 -> seen from its arrival side */
 
     for (int k = self->count - 1; k >= 0; k--) {
@@ -136,12 +134,12 @@ static void adjoint_sweep(mhe_t *self)
             const mhe_node_t *to = at(self, k + 1);
             double rate_bar[MHE_CHANNELS];
             for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-                const double w = to->theta[ch] - node->theta[ch] - LSTM_DT_S * node->rate[ch];
+                const double w = to->theta[ch] - node->theta[ch] - NET_DT_S * node->rate[ch];
                 pull[ch] = self->weight_noise[ch] * w;
                 self->qp[ch].gradient[k + 1] += pull[ch];
-                rate_bar[ch] = -LSTM_DT_S * pull[ch];
+                rate_bar[ch] = -NET_DT_S * pull[ch];
             }
-            lstm_adjoint(node->tape, node->c, rate_bar, c_bar, h_bar, theta_bar, c_bar, h_bar);
+            net_adjoint(node->tape, node->memory, rate_bar, memory_bar, theta_bar, memory_bar);
         }
         for (int ch = 0; ch < MHE_CHANNELS; ch++) {
             self->qp[ch].gradient[k] =
@@ -226,8 +224,8 @@ mhe_status_t mhe_solve(mhe_t *self, mhe_result_t *result)
         result->theta[ch] = newest->theta[ch];
         sum += newest->theta[ch];
     }
-    for (int k = 0; k < LSTM_HIDDEN; k++) {
-        sum += newest->c[k] + newest->h[k];
+    for (int k = 0; k < NET_MEMORY; k++) {
+        sum += newest->memory[k];
     }
     return isfinite(sum) ? status : MHE_INVALID;
 }
@@ -246,7 +244,7 @@ double mhe_cost(mhe_t *self, double gradient[][MHE_CHANNELS])
             const double residual = node->theta[ch] - node->y[ch];
             cost += 0.5 * weight_at(self, k, ch) * residual * residual;
             if (k + 1 < self->count) {
-                const double w = at(self, k + 1)->theta[ch] - node->theta[ch] - LSTM_DT_S * node->rate[ch];
+                const double w = at(self, k + 1)->theta[ch] - node->theta[ch] - NET_DT_S * node->rate[ch];
                 cost += 0.5 * self->weight_noise[ch] * w * w;
             }
             gradient[k][ch] = self->qp[ch].gradient[k];

@@ -1,4 +1,4 @@
-/* Moving horizon estimation of winding and rotor temperature with the trained LSTM as its model.
+/* Moving horizon estimation of winding and rotor temperature with the trained net as its model.
  *
  *   theta_{k+1} = theta_k + dt F(u_k, theta_k, c_k, h_k) + w_k,   (c, h)_{k+1} = LSTM(u_k, theta_k, c_k, h_k)
  *   min 1/2 |theta_0 - prior|^2_P0 + 1/2 sum |y_k - theta_k|^2_Wy + 1/2 sum |w_k|^2_Ww   over up to 16 nodes
@@ -18,7 +18,7 @@
 
 #include "box_qp.h"
 #include "est_settings.h"
-#include "lstm_net.h"
+#include "thermal_net.h"
 
 #define MHE_NODES 16 /* N = 15 stages; a power of two, the window is a ring */
 #define MHE_CHANNELS 2 /* 0 winding, 1 rotor */
@@ -34,11 +34,10 @@ typedef struct {
     double u[2];                 /* [speed rpm, torque Nm] of the stage that leaves this node */
     double y[MHE_CHANNELS];      /* measurement, offset removed */
     double weight[MHE_CHANNELS]; /* Wy, or 0 where there is none */
-    double c[LSTM_HIDDEN];       /* memory on arrival at this node */
-    double h[LSTM_HIDDEN];
+    double memory[NET_MEMORY];   /* of the net on arrival at this node */
     double rate[MHE_CHANNELS];   /* F of the stage that leaves this node */
     double slope[MHE_CHANNELS];  /* 1 + dt dF/dtheta of that stage, direct part */
-    double tape[LSTM_TAPE];
+    double tape[NET_TAPE];
 } mhe_node_t;
 
 typedef struct {
@@ -68,8 +67,8 @@ typedef struct {
 /* Take the weights, bounds and tolerances of `setting`; the window is empty. Copies; never fails. < 1 us. */
 void mhe_init(mhe_t *self, const est_setting_t *setting);
 
-/* Begin a window of one node with that prior and that memory of the net (LSTM_HIDDEN each). Never fails. */
-void mhe_start(mhe_t *self, const double prior[MHE_CHANNELS], const double c[], const double h[]);
+/* Begin a window of one node with that prior and that memory of the net (NET_MEMORY). Never fails. */
+void mhe_start(mhe_t *self, const double prior[MHE_CHANNELS], const double memory[]);
 
 /* Append a node: the newest one plus one step of the net with u = [speed rpm, torque Nm]. A full window drops its
  * oldest node; the prior becomes the last solution at the new oldest node, whose memory is kept. One net step. */
@@ -82,7 +81,7 @@ double mhe_measure(mhe_t *self, int age, int channel, double y);
 /* Solve from the present window. Cost: (sweeps - 1) forward passes and `sweeps` adjoint passes over the window. */
 mhe_status_t mhe_solve(mhe_t *self, mhe_result_t *result);
 
-/* The node `age` steps before the newest, NULL outside the window. The newest node's c, h belong to the solution. */
+/* The node `age` steps before the newest, NULL outside the window. The newest node's memory belongs to the solution. */
 const mhe_node_t *mhe_node(const mhe_t *self, int age);
 
 /* The cost at the present temperatures and its gradient (count rows of [winding, rotor], oldest first), bounds left

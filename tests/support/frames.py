@@ -27,6 +27,20 @@ GOLDEN: list[tuple[str, dict[str, float], str]] = [
         "8d3166e69919cccc",
     ),
     (
+        "EstValidity",
+        {
+            "outside_speed": 1.0,
+            "outside_torque": 0.0,
+            "outside_theta_w": 1.0,
+            "outside_theta_r": 0.0,
+            "outside_joint": 1.0,
+            "scope": 2.0,
+            "novelty": 21.845,
+            "tick": 52428.0,
+        },
+        "e55105005555cccc",
+    ),
+    (
         "EstTimingA",
         {
             "miss_late": 0.0,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = ("src/mhe.c", "src/estimator.c", "src/solver/tridiag.c", "src/solver/box_qp.c")
+SOURCES = ("src/mhe.c", "src/estimator.c", "src/validity.c", "src/solver/tridiag.c", "src/solver/box_qp.c")
 SETTINGS = ROOT / "estimator_c" / "settings"
 WEIGHTS = ROOT / "estimator_c" / "weights" / "lstm8.json"
 NODES = 16
@@ -56,6 +56,28 @@ class Counters(ct.Structure):
     )  # fmt: skip
 
 
+class Validity(ct.Structure):
+    """validity_result_t."""
+
+    KINDS = ("speed", "torque", "theta_w", "theta_r", "joint")
+    _fields_ = (
+        ("scope", ct.c_int), ("outside_speed", ct.c_bool), ("outside_torque", ct.c_bool),
+        ("outside_theta_w", ct.c_bool), ("outside_theta_r", ct.c_bool), ("outside_joint", ct.c_bool),
+        ("novelty", f64),
+    )  # fmt: skip
+
+    @property
+    def flags(self) -> tuple[bool, ...]:
+        """outside_*, in the order of KINDS."""
+        return tuple(bool(getattr(self, f"outside_{name}")) for name in self.KINDS)
+
+
+class ValidityMonitor(ct.Structure):
+    """validity_t."""
+
+    _fields_ = (("steps", ct.c_int32), ("slow", f64 * 5), ("result", Validity))
+
+
 class Out(ct.Structure):
     """estimator_out_t."""
 
@@ -63,6 +85,7 @@ class Out(ct.Structure):
         ("theta_w_degc", f64), ("theta_r_degc", f64), ("innov_w_degc", f64), ("innov_r_degc", f64),
         ("tick", ct.c_int64), ("tick16", ct.c_uint16), ("status", ct.c_int), ("stale_input", ct.c_bool),
         ("intervals", ct.c_int32), ("sweeps", ct.c_int32), ("kkt_degc", f64),
+        ("validity", Validity),
     )  # fmt: skip
 
 
@@ -124,7 +147,9 @@ class Lib:
         self.c.estimator_step.restype = None
         for name in ("mhe_init", "mhe_start", "mhe_advance", "mhe_solve", "estimator_init"):
             getattr(self.c, name).argtypes = None
-        self.sha256 = (ct.c_char * 65).in_dll(self.c, "lstm_weights_sha256").value.decode()
+        self.sha256 = (ct.c_char * 65).in_dll(self.c, "net_weights_sha256").value.decode()
+        self.memory = ct.c_int32.in_dll(self.c, "net_memory_size").value
+        self.tape = ct.c_int32.in_dll(self.c, "net_tape_size").value
 
     def setting(self, name: str, **changes: Any) -> Setting:
         """A copy of a compiled-in setting, with fields replaced (pairs as tuples)."""
@@ -139,25 +164,37 @@ class Lib:
         return setting
 
     def lstm_forward(self, u: Any, theta: Any, c: Any, h: Any) -> tuple[np.ndarray, ...]:
-        """(c_next, h_next, rate, tape) of one step."""
-        n = len(c)
-        outs = [np.zeros(n), np.zeros(n), np.zeros(2), np.zeros(5 * n)]
-        self.c.lstm_forward(*(_ptr(_f64(a)) for a in (u, theta, c, h)), *(_ptr(a) for a in outs))
+        """(c_next, h_next, rate, tape) of one step; c and h over all layers, a GRU's c is empty."""
+        outs = [np.zeros(self.memory), np.zeros(2), np.zeros(self.tape)]
+        self.c.net_forward(*(_ptr(_f64(a)) for a in (u, theta, self._memory(c, h))), *(_ptr(a) for a in outs))
+        return outs[0][: len(c)], outs[0][len(c) :], outs[1], outs[2]
+
+    def lstm_adjoint(self, tape: Any, memory: Any, rate_bar: Any, memory_bar: Any) -> tuple[np.ndarray, ...]:
+        """(theta_bar, memory_bar) of one step; memory = c, then h."""
+        outs = [np.zeros(2), np.zeros(self.memory)]
+        self.c.net_adjoint(*(_ptr(_f64(a)) for a in (tape, memory, rate_bar, memory_bar)), *(_ptr(a) for a in outs))
         return tuple(outs)
 
-    def lstm_adjoint(self, tape: Any, c: Any, rate_bar: Any, c_bar: Any, h_bar: Any) -> tuple[np.ndarray, ...]:
-        """(theta_bar, c_bar, h_bar) of one step."""
-        n = len(c)
-        outs = [np.zeros(2), np.zeros(n), np.zeros(n)]
-        ins = (tape, c, rate_bar, c_bar, h_bar)
-        self.c.lstm_adjoint(*(_ptr(_f64(a)) for a in ins), *(_ptr(a) for a in outs))
-        return tuple(outs)
-
-    def lstm_slope(self, tape: Any, c: Any) -> np.ndarray:
+    def lstm_slope(self, tape: Any, memory: Any) -> np.ndarray:
         """[drate_w/dtheta_w, drate_r/dtheta_r] of one step."""
         out = np.zeros(2)
-        self.c.lstm_slope(_ptr(_f64(tape)), _ptr(_f64(c)), _ptr(out))
+        self.c.net_slope(_ptr(_f64(tape)), _ptr(_f64(memory)), _ptr(out))
         return out
+
+    def validity(self, rows: Any) -> list[Validity]:
+        """What a monitor that has seen nothing says of rows (n, 4): rpm, Nm, degC, degC, one per interval."""
+        monitor, results = ValidityMonitor(), []
+        self.c.validity_init(ct.byref(monitor))
+        for row in _f64(rows):
+            self.c.validity_step(ct.byref(monitor), _ptr(row), _ptr(row[2:]))
+            results.append(Validity.from_buffer_copy(monitor.result))
+        return results
+
+    def _memory(self, c: Any, h: Any) -> np.ndarray:
+        memory = np.concatenate([c, h])
+        if len(memory) != self.memory:
+            raise ValueError(f"{self.path} was built for a memory of {self.memory}, not {len(memory)}")
+        return memory
 
 
 _KEEP: list[np.ndarray] = []
@@ -183,7 +220,7 @@ class Mhe:
         lib.c.mhe_init(self.memory, ct.byref(setting))
 
     def start(self, prior: Any, c: Any, h: Any) -> None:
-        self.lib.c.mhe_start(self.memory, *(_ptr(_f64(a)) for a in (prior, c, h)))
+        self.lib.c.mhe_start(self.memory, _ptr(_f64(prior)), _ptr(_f64(np.concatenate([c, h]))))
         self.count = 1
 
     def advance(self, u: Any) -> None:
@@ -211,10 +248,10 @@ class Mhe:
             node = self.lib.c.mhe_node(self.memory, age)
             node[0], node[1] = float(theta[row, 0]), float(theta[row, 1])
 
-    def memory_of(self, age: int, hidden: int) -> tuple[np.ndarray, np.ndarray]:
-        """(c, h) on arrival at a node."""
+    def memory_of(self, age: int, size_c: int) -> tuple[np.ndarray, np.ndarray]:
+        """(c, h) on arrival at a node; size_c: elements of c (0 for a GRU)."""
         node = self.lib.c.mhe_node(self.memory, age)
-        return np.array(node[8 : 8 + hidden]), np.array(node[8 + hidden : 8 + 2 * hidden])
+        return np.array(node[8 : 8 + size_c]), np.array(node[8 + size_c : 8 + self.lib.memory])
 
     def cost(self) -> tuple[float, np.ndarray]:
         gradient = np.zeros((NODES, 2))

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from estimator_c.formulation.weights import CELLS, FORMAT_STACK, NetWeights
+
 Y_SPAN, Y_LOW = 1.07564811 + 0.63202183, -0.63202183  # output normalisation of the paper's net, degC/s
 
 
@@ -39,19 +41,52 @@ def weights_document(w_u: Any, w_h: Any, b: Any, w_y: Any, b_y: Any, **outputs: 
     }
 
 
-def random_net(folder: Path, hidden: int = 8, seed: int = 0, gain: float = 1.0) -> Path:
-    """Write a net nobody trained; `gain` scales all gate weights (1: as strong as a trained net's)."""
+def random_net(
+    folder: Path, hidden: int = 8, seed: int = 0, gain: float = 1.0, cell: str = "lstm", layers: int = 1
+) -> Path:
+    """Write a net nobody trained; `gain` scales all gate weights (1: as strong as a trained net's).
+
+    One layer of LSTM cells is written in format 1, everything else in format 2.
+    """
     rng = np.random.default_rng(seed)
-    path = folder / f"random-{hidden}-{seed}-{gain:g}.json"
-    document = weights_document(
-        gain * rng.normal(0.0, 0.8, (4 * hidden, 4)),
-        gain * rng.normal(0.0, 0.4, (4 * hidden, hidden)),
-        rng.normal(0.0, 0.5, 4 * hidden),
-        rng.normal(0.0, 0.4, (2, hidden)),
-        rng.normal(0.3, 0.1, 2),
-    )
+    path = folder / f"random-{cell}-{layers}x{hidden}-{seed}-{gain:g}.json"
+    gates = 4 if cell == "lstm" else 3
+    recurrent = min(0.4, 1.2 / np.sqrt(hidden))  # more cells do not make a net wilder
+    w_u = [gain * rng.normal(0.0, 0.8, (gates * hidden, 4))]
+    w_h = [gain * rng.normal(0.0, recurrent, (gates * hidden, hidden))]
+    b = [rng.normal(0.0, 0.5, gates * hidden)]
+    w_y, b_y = rng.normal(0.0, min(0.4, 1.2 / np.sqrt(hidden)), (2, hidden)), rng.normal(0.3, 0.1, 2)
+    for _ in range(1, layers):
+        w_u.append(gain * rng.normal(0.0, 0.6, (gates * hidden, hidden)))
+        w_h.append(gain * rng.normal(0.0, recurrent, (gates * hidden, hidden)))
+        b.append(rng.normal(0.0, 0.5, gates * hidden))
+    document = weights_document(w_u[0], w_h[0], b[0], w_y, b_y)
+    if (cell, layers) != ("lstm", 1):
+        stacks = {"W_u": w_u, "W_h": w_h, "b": b}
+        if cell == "gru":
+            stacks["b_h"] = [rng.normal(0.0, 0.5, gates * hidden) for _ in range(layers)]
+        document |= {key: [table.tolist() for table in tables] for key, tables in stacks.items()}
+        document |= {"format": FORMAT_STACK, "cell": cell, "layers": layers, "gate_order": CELLS[cell]}
     path.write_text(json.dumps(document), encoding="utf-8")
     return path
+
+
+def torch_net(weights: NetWeights) -> tuple[Any, Any]:
+    """(torch.nn.LSTM or GRU, torch.nn.Linear) in float64 with these weights, batch first; needs torch."""
+    import torch
+
+    kind = torch.nn.LSTM if weights.cell == "lstm" else torch.nn.GRU
+    cells = kind(4, weights.hidden, num_layers=len(weights.stack), batch_first=True, dtype=torch.float64)
+    output = torch.nn.Linear(weights.hidden, 2, dtype=torch.float64)
+    with torch.no_grad():
+        for k, layer in enumerate(weights.stack):
+            values = {"weight_ih": layer.w_u, "weight_hh": layer.w_h, "bias_ih": layer.b, "bias_hh": layer.b_h}
+            for name, value in values.items():
+                parameter = getattr(cells, f"{name}_l{k}")
+                parameter.copy_(torch.zeros_like(parameter) if value is None else torch.tensor(value))
+        output.weight.copy_(torch.tensor(weights.w_y))
+        output.bias.copy_(torch.tensor(weights.b_y))
+    return cells, output
 
 
 def reference_folder() -> Path:

@@ -6,8 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[2]
 RT_RUNNER = [sys.executable, "-m", "rt_runner.cli"]
 
@@ -40,20 +38,6 @@ def start_rt_runner(*args, env: dict | None = None) -> subprocess.Popen:
 def load_result(path: Path) -> dict:
     """A result as ``--json`` wrote it."""
     return json.loads(path.read_text())
-
-
-def have_vcan(name: str = "vcan0") -> bool:
-    """Whether the interface exists here."""
-    return Path(f"/sys/class/net/{name}").exists()
-
-
-def need_vcan(name: str = "vcan0") -> None:
-    """Skip with a reason where there is no vcan; fail where the lab promised one."""
-    if have_vcan(name):
-        return
-    if os.environ.get("RT_REQUIRE_VCAN") == "1":
-        pytest.fail(f"{name} must exist here (RT_REQUIRE_VCAN=1) and does not")
-    pytest.skip(f"no {name}: this kernel has no CAN; tools/run-tests runs this test in the lab")
 
 
 def one_line(text: str) -> str:

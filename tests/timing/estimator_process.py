@@ -28,7 +28,7 @@ DBC = load_dbc()
 DBC_SHA256 = hashlib.sha256(DEFAULT_DBC.read_bytes()).hexdigest()
 MS = 1_000_000
 TICK_NS = 10 * MS
-PER_JOB = ("Estimate", "EstimateInnov", "EstTimingA", "EstTimingB")
+PER_JOB = ("Estimate", "EstimateInnov", "EstValidity", "EstTimingA", "EstTimingB")
 COUNTERS = ("EstReleases", "EstMisses", "EstInputFaults", "EstBusFaults", "EstCoreFaults", "EstCoreFaults2")
 IDENTITY = ("EstIdentity", "EstBuild", "EstGranted")
 
@@ -118,7 +118,7 @@ class Run:
 
     def payload(self) -> list[tuple]:
         """Everything the estimator concluded: record time and content of the frames that carry no timing."""
-        return [(f.t_ns, f.name, f.data) for f in self.frames if f.name in ("Estimate", "EstimateInnov")]
+        return [(f.t_ns, f.name, f.data) for f in self.frames if f.name in ("Estimate", "EstimateInnov", "EstValidity")]
 
 
 def _sort_lines(text: str) -> tuple[dict | None, dict | None, list[str]]:
@@ -234,8 +234,8 @@ class OnBus:
 
 
 def per_job(run: Run) -> Iterator[tuple[Frame, ...]]:
-    """The four frames of each job, in the order they must come."""
+    """The frames of each job, in the order they must come."""
     frames = [f for f in run.frames if f.name in PER_JOB]
-    assert [f.name for f in frames] == list(PER_JOB) * (len(frames) // 4)
-    for i in range(0, len(frames), 4):
-        yield tuple(frames[i : i + 4])
+    assert [f.name for f in frames] == list(PER_JOB) * (len(frames) // len(PER_JOB))
+    for i in range(0, len(frames), len(PER_JOB)):
+        yield tuple(frames[i : i + len(PER_JOB)])

@@ -41,6 +41,17 @@ def release():
     return binary("release")
 
 
+def check_validity_frames(said):
+    """The made-up drive goes beyond the power the net was trained on, and beyond nothing else."""
+    assert (said[0]["scope"], said[0]["novelty"]) == (0, None), "nothing has been estimated yet"
+    judged = [v for v in said if v["scope"] > 0]
+    assert {v["scope"] for v in judged} == {1}, "the history is shorter than two minutes"
+    for v in judged:
+        assert v["novelty"] >= 1 if v["outside_joint"] else 0 < v["novelty"] <= 1
+        assert not any(v[f"outside_{kind}"] for kind in ("speed", "torque", "theta_w", "theta_r"))
+    assert {v["outside_joint"] for v in judged} == {0, 1}, "the drive crosses the limit"
+
+
 @pytest.mark.parametrize("period_ms", [100, 1, 10, 250, 1000])
 def test_one_estimate_per_job_and_everything_accounted_for(program, period_ms):
     seconds = 4 if period_ms < 10 else 12
@@ -56,15 +67,15 @@ def test_one_estimate_per_job_and_everything_accounted_for(program, period_ms):
     assert run.final["miss_skipped"] == 0
     assert {f.e2e for f in run.frames} == {E2eStatus.OK}, "a gap in a counter"
     assert run.controls == [*((t * TICK_NS, TICK) for t in range(seconds * 100 + 1)), (seconds * 1000 * MS, END)]
-    for n, (estimate, innov, timing_a, timing_b) in enumerate(jobs, start=1):
+    for n, (estimate, innov, validity, timing_a, timing_b) in enumerate(jobs, start=1):
         assert timing_a.values["release_index"] == n
         assert timing_a.values["wake_lat_us"] is None, "nothing sleeps in lock-step"
         assert timing_a.values["warmup"] == (n <= warmup)
         assert timing_b.values["resp_us"] >= timing_b.values["exec_wall_us"] > 0
-        assert {f.t_ns for f in (estimate, innov, timing_a, timing_b)} == {n * period_ms * MS}
+        assert {f.t_ns for f in (estimate, innov, validity, timing_a, timing_b)} == {n * period_ms * MS}
         # Releases run at TICK, when everything before has been delivered: the newest tick is the one in use.
         assert estimate.values["tick"] == n * period_ms // 10
-        assert innov.values["tick"] == estimate.values["tick"]
+        assert innov.values["tick"] == validity.values["tick"] == estimate.values["tick"]
     # Counters once a second of release time, and at the end; identity with the first job and every ten seconds, but
     # where both are due in the job after. With a job a second that job is the next counters', and they give way.
     counted = [s for s in range(1, seconds + 1) if period_ms < 1000 or s not in (2, 11)]
@@ -76,8 +87,9 @@ def test_one_estimate_per_job_and_everything_accounted_for(program, period_ms):
     for name in IDENTITY:
         assert [f.t_ns for f in run.named(name)] == [ms * MS for ms in identified]
     together = Counter(f.t_ns for f in run.frames if f.t_ns < seconds * 1000 * MS)
-    assert max(together.values()) <= 10, "the send queue of a CAN interface"
+    assert max(together.values()) <= 11, "the send queue of a CAN interface and its controller"
     assert jobs[-1][0].values["status"] == OK
+    check_validity_frames([job[2].values for job in jobs])
     assert run.named("EstReleases")[-1].values["jobs"] == len(jobs)
 
 
@@ -108,7 +120,7 @@ def test_same_input_same_bytes(release):
     records = drive(range(500))
     first, second = run_drive(release, records), run_drive(release, records)
     assert first.payload() == second.payload()
-    assert len(first.payload()) == 2 * 49
+    assert len(first.payload()) == 3 * 49
 
 
 BASE = drive(range(301))
@@ -219,8 +231,8 @@ def test_silent_plant_makes_stale_inputs_and_is_seen_on_the_bus(program):
     records = [r for r in drive(range(1201)) if not (r.can_id == 0x0A0 and r.t_ns // TICK_NS in silent)]
     run = run_drive(program, records)
     assert run.status == 0
-    stale = [a.values["release_index"] for _, _, a, _ in per_job(run) if a.values["stale_input"]]
-    for estimate, _, timing_a, timing_b in per_job(run):
+    stale = [a.values["release_index"] for *_, a, _ in per_job(run) if a.values["stale_input"]]
+    for estimate, *_, timing_a, timing_b in per_job(run):
         if timing_a.values["stale_input"]:
             assert timing_b.values["miss_cause"] == STALE_CAUSE
         if 61 <= timing_a.values["release_index"] <= 79:
@@ -244,7 +256,7 @@ def test_a_plant_that_sends_but_stands_still_is_stale(program):
         records.append(tick_record(tick * TICK_NS))
     run = run_drive(program, records)
     assert (run.status, run.final["seq_errors"]) == (0, 0)
-    for estimate, _, timing_a, _ in per_job(run):
+    for estimate, _, _, timing_a, _ in per_job(run):
         n = timing_a.values["release_index"]
         if n > 20:
             assert timing_a.values["stale_input"] == (61 <= n <= 80), n  # 80 works off the intervals without a frame

@@ -12,7 +12,9 @@ import pytest
 from rt_runner.dbc import load_dbc
 from rt_runner.mcap_log import read_log
 from rt_runner.result import Unwrapper
-from tests.support.runs import load_result, need_vcan, rt_runner
+from tests.support.buses import have_vcan
+from tests.support.runs import load_result, rt_runner
+from tests.timing.estimator_process import PER_JOB
 
 SECONDS = 15
 DBC = load_dbc()
@@ -21,7 +23,7 @@ DBC = load_dbc()
 @pytest.fixture(scope="module", params=["hub", pytest.param("vcan0", marks=pytest.mark.vcan)])
 def run(request, tmp_path_factory):
     if request.param == "vcan0":
-        need_vcan()
+        have_vcan()
     folder = tmp_path_factory.mktemp(request.param)
     log, out = folder / "run.mcap", folder / "run.json"
     done = rt_runner("run", "hot-lap", "--bus", request.param, "--duration", SECONDS, "--log", log, "--json", out)
@@ -74,10 +76,10 @@ def test_skipped_releases_are_announced_by_the_next_job(run):
 
 
 def test_one_estimate_frame_per_executed_job(run):
-    counts = {n: len(run.frames[n]) for n in ("Estimate", "EstimateInnov", "EstTimingA", "EstTimingB")}
+    counts = {n: len(run.frames[n]) for n in PER_JOB}
     assert len(set(counts.values())) == 1, counts
     jobs = [n for _, n, _ in run.order if n in counts]
-    assert jobs == ["Estimate", "EstimateInnov", "EstTimingA", "EstTimingB"] * counts["Estimate"]
+    assert jobs == list(PER_JOB) * counts["Estimate"]
 
 
 def test_response_is_late_exactly_where_the_flag_says(run):

@@ -25,6 +25,11 @@ CONTRACT = {
     "EstimateInnov": (0x2A1, "ESTIMATOR", 100, {
         "sweeps": (12, 4, False, 1, 0, False), "innov_w_degc": (16, *S16, 1 / 256, 0, True),
         "innov_r_degc": (32, *S16, 1 / 256, 0, True), "tick": (48, *U16, 1, 0, False)}),
+    "EstValidity": (0x2A2, "ESTIMATOR", 100, {
+        "outside_speed": (12, 1, False, 1, 0, False), "outside_torque": (13, 1, False, 1, 0, False),
+        "outside_theta_w": (14, 1, False, 1, 0, False), "outside_theta_r": (15, 1, False, 1, 0, False),
+        "outside_joint": (16, 1, False, 1, 0, False), "scope": (17, 2, False, 1, 0, False),
+        "novelty": (32, *U16, 0.001, 0, True), "tick": (48, *U16, 1, 0, False)}),
     "EstTimingA": (0x2A8, "ESTIMATOR", 100, {
         "miss_late": (12, 1, False, 1, 0, False), "warmup": (13, 1, False, 1, 0, False),
         "stale_input": (14, 1, False, 1, 0, False), "after_skip": (15, 1, False, 1, 0, False),
@@ -81,7 +86,8 @@ def test_the_file_is_the_agreed_contract():
     assert found == CONTRACT
     assert all(m.length == 8 and not m.codec.is_extended_frame for m in dbc)
     assert {m.name for m in dbc if m.simulation_only} == {"TruthTemp", "TruthVehicle"}
-    assert {m.name for m in dbc if m.per_job} == {"Estimate", "EstimateInnov", "EstTimingA", "EstTimingB"}
+    per_job = {"Estimate", "EstimateInnov", "EstValidity", "EstTimingA", "EstTimingB"}
+    assert {m.name for m in dbc if m.per_job} == per_job
 
 
 def test_cantools_loads_it_strictly_and_shows_labels():

@@ -36,22 +36,22 @@ def test_generating_twice_gives_the_same_bytes(tmp_path: Path) -> None:
         done = run_generator(WEIGHTS, tmp_path / folder, PYTHONHASHSEED=seed)
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     names = sorted(path.name for path in (tmp_path / "a").iterdir())
-    assert names == ["est_settings.c", "est_settings.h", "lstm_net.c", "lstm_net.h"]
+    assert names == [f"{name}.{kind}" for name in ("est_settings", "thermal_net", "train_envelope") for kind in "ch"]
     for name in names:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
 def test_unchanged_files_keep_their_time_stamp(tmp_path: Path) -> None:
     run_generator(WEIGHTS, tmp_path)
-    os.utime(tmp_path / "lstm_net.c", (1, 1))
+    os.utime(tmp_path / "thermal_net.c", (1, 1))
     run_generator(WEIGHTS, tmp_path)
-    assert (tmp_path / "lstm_net.c").stat().st_mtime == 1
+    assert (tmp_path / "thermal_net.c").stat().st_mtime == 1
 
 
 def test_generated_code_is_c11_without_warnings_or_memory(tmp_path: Path) -> None:
     run_generator(WEIGHTS, tmp_path)
     flags = ["-std=c11", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-O1"]
-    for source in ("lstm_net.c", "est_settings.c"):
+    for source in ("thermal_net.c", "train_envelope.c", "est_settings.c"):
         subprocess.run(
             ["gcc", *flags, f"-I{tmp_path}", "-c", str(tmp_path / source), "-o", str(tmp_path / f"{source}.o")],
             check=True,
@@ -68,13 +68,14 @@ def test_identity_is_the_sha256_of_the_file(tmp_path: Path) -> None:
     assert f"{weights.hash24:06x}" == weights.sha256[:6]
     lib = Lib(compile_library(WEIGHTS))
     assert lib.sha256 == weights.sha256
-    assert ct.c_uint32.in_dll(lib.c, "lstm_weights_hash24").value == weights.hash24
+    assert ct.c_uint32.in_dll(lib.c, "net_weights_hash24").value == weights.hash24
 
 
 Change = Callable[[dict[str, Any]], Any]
 CORRUPTIONS: dict[str, tuple[str, Change]] = {
     "format": ("format", lambda d: d.update(format="something/2")),
     "cell": ("cell", lambda d: d.update(cell="gru")),
+    "cell of no name": ("cell", lambda d: d.update(cell=["lstm"])),
     "layers": ("layers", lambda d: d.update(layers=2)),
     "gates": ("gate_order", lambda d: d.update(gate_order="ifog")),
     "step": ("dt_s", lambda d: d.update(dt_s=0.2)),

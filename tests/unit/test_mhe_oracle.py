@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes as ct
 import subprocess
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -15,9 +15,10 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from estimator_c.formulation.lstm_numpy import lstm_step
-from estimator_c.formulation.mhe import MheOracle, MheProblem
-from estimator_c.formulation.weights import LstmWeights, load_weights
-from tests.support.libest import NODES, WEIGHTS, Lib, Mhe, Setting, compile_library
+from estimator_c.formulation.mhe import MheOracle
+from estimator_c.formulation.weights import NetWeights, load_weights
+from tests.support.libest import NODES, WEIGHTS, Lib, Mhe, compile_library
+from tests.support.mhe_recorder import Record, Recorder, record
 
 AGREEMENT_DEGC = 1e-6
 TIGHT = {"tolerance_degc": 1e-9, "max_sweeps": 60}
@@ -29,7 +30,7 @@ def library() -> Lib:
 
 
 @cache
-def weights() -> LstmWeights:
+def weights() -> NetWeights:
     return load_weights(WEIGHTS)
 
 
@@ -38,78 +39,9 @@ def oracle(statement: str) -> MheOracle:
     return MheOracle(weights(), statement)
 
 
-@dataclass(frozen=True)
-class Record:
-    """A recorded drive at the net's rate: inputs u (n, 2), true temperatures (n, 2), noisy measurements (n, 2)."""
-
-    u: np.ndarray
-    theta: np.ndarray
-    y: np.ndarray
-
-
 @cache
-def record(start_degc: tuple[float, float] = (140.0, 110.0), seed: int = 1, steps: int = 60) -> Record:
-    """The net itself with process noise, driven hard; measurements with the sensor's noise."""
-    rng = np.random.default_rng(seed)
-    u = np.repeat(np.stack([rng.uniform(3000, 10000, 12), rng.uniform(-80, 155, 12)], 1), 5, axis=0)[:steps]
-    theta = np.empty((steps, 2))
-    theta[0] = start_degc
-    c = h = np.zeros(weights().hidden)
-    for k in range(steps - 1):
-        c, h, rate = lstm_step(weights(), np.concatenate([u[k], theta[k]]), c, h)
-        theta[k + 1] = theta[k] + 0.1 * rate + rng.normal(0, [0.02, 0.005])
-    return Record(u, theta, theta + rng.normal(0, np.sqrt(0.1), theta.shape))
-
-
-@dataclass
-class Recorder:
-    """Runs the C over a record and keeps the problem that each step solved, in the oracle's terms."""
-
-    setting: Setting
-    data: Record
-    missing: frozenset[tuple[int, int]] = frozenset()  # (step, channel) without a measurement
-
-    def __post_init__(self) -> None:
-        self.mhe = Mhe(library(), self.setting)
-        self.mhe.start(self.data.y[0], np.zeros(8), np.zeros(8))
-        self.prior, self.step = self.data.y[0], 0
-        self.measure(0)
-
-    def measure(self, k: int) -> None:
-        for channel in range(2):
-            if (k, channel) not in self.missing:
-                self.mhe.measure(self.step - k, channel, self.data.y[k, channel])
-
-    def advance(self) -> None:
-        if self.mhe.count == NODES:
-            self.prior = self.mhe.theta()[1]
-        self.mhe.advance(self.data.u[self.step])
-        self.step += 1
-        self.measure(self.step)
-
-    def problem(self) -> MheProblem:
-        s, count = self.setting, self.mhe.count
-        first = self.step - count + 1
-        weight = np.tile(np.array(s.weight_measurement[:]), (count, 1))
-        for k, channel in self.missing:
-            if first <= k <= self.step:
-                weight[k - first, channel] = 0.0
-        if not s.newest_measurement:
-            weight[-1] = 0.0
-        c, h = self.mhe.memory_of(count - 1, 8)
-        return MheProblem(
-            u=self.data.u[first : self.step],
-            y=self.data.y[first : self.step + 1],
-            weight=weight,
-            prior=self.prior,
-            weight_arrival=np.array(s.weight_arrival[:] if first > 0 else s.weight_prior[:]),
-            weight_noise=np.array(s.weight_noise[:]),
-            c=c,
-            h=h,
-            lower=s.lower_degc,
-            upper=s.upper_degc,
-            bound_weight=None if s.hard_bounds else s.bound_weight,
-        )
+def data() -> Record:
+    return record(weights())
 
 
 CASES = {
@@ -131,7 +63,7 @@ STEPS = (0, 1, 7, 15, 16, 17, 35)  # the growing window, the first shifts, the s
 
 def recorder(name: str, **extra: float) -> Recorder:
     (setting, changes), kwargs = CASES[name]
-    return Recorder(library().setting(setting, **TIGHT, **changes, **extra), record(), **kwargs)
+    return Recorder(library(), weights(), library().setting(setting, **TIGHT, **changes, **extra), data(), **kwargs)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -226,7 +158,7 @@ def test_unusable_measurement_is_ignored(age: int, channel: int, y: float) -> No
 
 
 def test_sweep_limit_is_reported_and_empty_window_is_invalid() -> None:
-    run = Recorder(library().setting("default", max_sweeps=1, tolerance_degc=1e-9), record())
+    run = Recorder(library(), weights(), library().setting("default", max_sweeps=1, tolerance_degc=1e-9), data())
     run.advance()
     assert run.mhe.solve()[0] == 1
     empty = Mhe(library(), library().setting("default"))
@@ -243,7 +175,7 @@ def test_not_finite_is_invalid(where: str) -> None:
 
 
 def test_default_setting_converges_in_few_sweeps() -> None:
-    run = Recorder(library().setting("default"), record())
+    run = Recorder(library(), weights(), library().setting("default"), data())
     sweeps = []
     for _ in range(50):
         run.advance()
