@@ -25,9 +25,3 @@ def binary(name: str) -> Path:
     if not os.access(path, os.X_OK):
         raise SetupError(f"{path} is missing: run 'make build' in {ROOT}")
     return path
-
-
-def generated_hash(name: str) -> str | None:
-    """Contents of a small generated text file (``weights_sha256`` …), None where absent."""
-    path = build_dir() / "gen" / name
-    return path.read_text().strip() if path.is_file() else None

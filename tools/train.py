@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import importlib.util
 import math
 import sys
 import tempfile
@@ -24,6 +23,7 @@ import torch
 
 from estimator_c.formulation.errors import FormulationError
 from estimator_c.formulation.weights import LstmWeights, load_weights
+from tools.envelope import envelope_of
 from tools.evaluate import DataError, Rows, evaluate, load_rows, table
 from tools.lstm_torch import weights_document, write_document
 from tools.train_configs import CHOICES, CONFIGS, Settings
@@ -55,10 +55,9 @@ def document_of(result: Fit, rows: Rows, lap: Rows | None, s: Settings) -> dict[
     if lap is not None:
         metrics["lap"] = evaluate(as_read(document), lap)
         metrics["lap_sha256"] = lap.sha256
-    if importlib.util.find_spec("tools.envelope"):  # what the estimator's watch over its inputs is made from
-        envelope = importlib.import_module("tools.envelope").envelope_of(rows)
-        if envelope is not None:
-            document["envelope"] = envelope
+    envelope = envelope_of(rows)  # what the estimator's watch over its inputs is made from
+    if envelope is not None:
+        document["envelope"] = envelope
     document["data_sha256"] = rows.sha256
     document["training"] = {
         **dataclasses.asdict(s),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 
@@ -114,9 +113,6 @@ def test_unknown_net_is_one_line(study, capsys):
     assert "LSTM 2x8" in message
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("tools.bench_net") is None, reason="tools.bench_net is absent: the cost is NOT tested here"
-)
 def test_instructions_are_read_from_the_benchmark(study, monkeypatch):
     """The names that tools.bench_net writes are those that the study reads."""
     import dataclasses
