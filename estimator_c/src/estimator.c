@@ -212,6 +212,11 @@ void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc
     }
 }
 
+void estimator_feed_coolant(estimator_t *self, uint16_t tick16, double coolant_degc, bool soaked, bool valid)
+{
+    (void)self, (void)tick16, (void)coolant_degc, (void)soaked, (void)valid;
+}
+
 /* Close interval k: the mean of its frames, or the last input held. */
 static void close_interval(estimator_t *self, int64_t k, bool *stale)
 {
@@ -409,6 +414,10 @@ void estimator_step(estimator_t *self, estimator_out_t *out)
     *out = (estimator_out_t){
         .theta_w_degc = NAN, .theta_r_degc = NAN, .innov_w_degc = NAN, .innov_r_degc = NAN, .kkt_degc = NAN,
         .tick = self->newest_tick, .tick16 = (uint16_t)self->newest_tick};
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        out->channel[ch] = (estimator_channel_t){.sigma_degc = NAN, .upper_degc = NAN, .innov_sigma_degc = NAN};
+        out->calibration.offset_degc[ch] = self->setting.offset_degc;
+    }
     while (self->anchored && self->motor_seen &&
            self->newest_tick >= self->grid_tick + ESTIMATOR_TICKS * (self->next_interval + 1)) {
         consume_interval(self, out);

@@ -29,7 +29,44 @@ typedef enum {
                                 * never had one started at the other's temperature */
     ESTIMATOR_INPUT_STALE = 4, /* the newest interval had no motor frame: its input was held */
     ESTIMATOR_INVALID = 5,     /* a result was not finite; the estimator has started again */
+    ESTIMATOR_OPEN_LOOP = 6,   /* a channel without a trusted sensor for longer than the setting's limit: the upper bound grows */
+    ESTIMATOR_FALLBACK = 7,    /* the MHE gave no usable solution: the estimate is the Kalman filter's */
 } estimator_status_t;
+
+/* What the innovations say about a sensor. */
+typedef enum {
+    SENSOR_OK = 0,
+    SENSOR_OFFSET = 1,  /* stepped away and stays there */
+    SENSOR_NOISE = 2,   /* far noisier than it should be */
+    SENSOR_STUCK = 3,   /* the same value again and again */
+    SENSOR_DROPOUT = 4, /* no value, or one no winding can have (open or short circuit) */
+    SENSOR_SPIKE = 5,   /* single values far out */
+    SENSOR_DRIFT = 6,   /* creeps away */
+    SENSOR_SLOW = 7,    /* late or lagging: the innovation follows the rate of change */
+} sensor_class_t;
+
+/* One temperature, beside its estimate. */
+typedef struct {
+    sensor_class_t fault;    /* of its sensor */
+    bool trusted;            /* the newest measurement counts in the estimate */
+    double sigma_degc;       /* standard deviation of the published estimate; NAN before the first */
+    double upper_degc;       /* conservative upper bound of the temperature; NAN before the first */
+    double innov_sigma_degc; /* predicted standard deviation of the innovation; NAN if none came since */
+} estimator_channel_t;
+
+typedef enum {
+    CALIBRATION_DATASHEET = 0, /* the setting's offset is in use */
+    CALIBRATION_MEASURING = 1, /* key-on with the machine at coolant temperature: averaging */
+    CALIBRATION_FROZEN = 2,    /* the measured offset is in use and stays */
+    CALIBRATION_REFUSED = 3,   /* measured, but not believable: the setting's offset stays in use */
+} calibration_state_t;
+
+/* The sensors' offset as it is being subtracted. */
+typedef struct {
+    calibration_state_t state;
+    double offset_degc[MHE_CHANNELS];
+    double sigma_degc[MHE_CHANNELS];
+} estimator_calibration_t;
 
 typedef enum {
     ESTIMATOR_OK = 0,
@@ -59,6 +96,8 @@ typedef struct {
     int32_t sweeps;                    /* most sweeps of any MHE solution in this step, 0: none was computed */
     double kkt_degc;                   /* of the last MHE solution in this step, see mhe.h; NAN: none */
     validity_result_t validity;        /* of the newest interval's input to the net */
+    estimator_channel_t channel[MHE_CHANNELS];
+    estimator_calibration_t calibration;
 } estimator_out_t;
 
 typedef struct {
@@ -114,6 +153,10 @@ void estimator_feed_motor(estimator_t *self, uint16_t tick16, double torque_nm, 
 /* Take one TempMeas as it came from the sensor, offset included. Never fails. < 0.1 us. */
 void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc, double theta_r_degc, bool w_valid,
                          bool r_valid);
+
+/* Take the coolant temperature, and whether the machine has stood long enough for all of it to have that temperature
+ * (soaked). Only the offset calibration at key-on looks at it. Never fails. < 0.1 us. */
+void estimator_feed_coolant(estimator_t *self, uint16_t tick16, double coolant_degc, bool soaked, bool valid);
 
 /* Consume every completed interval (one MHE step each, at most max_gap_steps + 1) and publish. Cost: per interval one
  * mhe_solve() and delay_steps net steps; without a completed interval at most one net step, or one re-solve when a

@@ -17,7 +17,9 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = ("src/mhe.c", "src/estimator.c", "src/validity.c", "src/solver/tridiag.c", "src/solver/box_qp.c")
+SOURCES = (
+    "src/mhe.c", "src/estimator.c", "src/validity.c", "src/est_batch.c", "src/solver/tridiag.c", "src/solver/box_qp.c",
+)  # fmt: skip
 SETTINGS = ROOT / "estimator_c" / "settings"
 WEIGHTS = ROOT / "estimator_c" / "weights" / "lstm8.json"
 NODES = 16
@@ -78,6 +80,19 @@ class ValidityMonitor(ct.Structure):
     _fields_ = (("steps", ct.c_int32), ("slow", f64 * 5), ("result", Validity))
 
 
+class Channel(ct.Structure):
+    """estimator_channel_t."""
+
+    _fields_ = (("fault", ct.c_int), ("trusted", ct.c_bool), ("sigma_degc", f64), ("upper_degc", f64),
+                ("innov_sigma_degc", f64))  # fmt: skip
+
+
+class Calibration(ct.Structure):
+    """estimator_calibration_t."""
+
+    _fields_ = (("state", ct.c_int), ("offset_degc", pair), ("sigma_degc", pair))
+
+
 class Out(ct.Structure):
     """estimator_out_t."""
 
@@ -85,7 +100,7 @@ class Out(ct.Structure):
         ("theta_w_degc", f64), ("theta_r_degc", f64), ("innov_w_degc", f64), ("innov_r_degc", f64),
         ("tick", ct.c_int64), ("tick16", ct.c_uint16), ("status", ct.c_int), ("stale_input", ct.c_bool),
         ("intervals", ct.c_int32), ("sweeps", ct.c_int32), ("kkt_degc", f64),
-        ("validity", Validity),
+        ("validity", Validity), ("channel", Channel * 2), ("calibration", Calibration),
     )  # fmt: skip
 
 
@@ -277,6 +292,33 @@ class Estimator:
     def step(self) -> Out:
         self._step(self.memory, ct.byref(self._out))
         return Out.from_buffer_copy(self._out)
+
+    def feed_coolant(self, tick: int, coolant_degc: float, soaked: bool, valid: bool = True) -> None:
+        self.lib.c.estimator_feed_coolant(self.memory, ct.c_uint16(tick & 0xFFFF), f64(coolant_degc), soaked, valid)
+
+    def run(
+        self,
+        torque_nm: Any,
+        speed_rpm: Any,
+        measured_degc: Any,
+        first_tick: int = 0,
+        coolant_degc: Any = None,
+        soaked: Any = None,
+    ) -> np.ndarray:
+        """est_batch_run(): torque, speed (10 n,), measurements (n, 2) -> (n, 20), columns as in est_batch.h."""
+        measured = _f64(measured_degc)
+        torque, speed = _f64(torque_nm).ravel(), _f64(speed_rpm).ravel()
+        n = len(measured)
+        if measured.shape != (n, 2) or len(torque) != 10 * n or len(speed) != 10 * n:
+            raise ValueError(f"{len(torque)} torques, {len(speed)} speeds for measurements {measured.shape}: 10 a row")
+        coolant = None if coolant_degc is None else _f64(coolant_degc)
+        flags = None if soaked is None else np.ascontiguousarray(soaked, dtype=np.bool_)
+        out = np.empty((n, 20))
+        self.lib.c.est_batch_run(
+            self.memory, ct.c_int64(n), ct.c_uint16(first_tick & 0xFFFF), _ptr(torque), _ptr(speed), _ptr(measured),
+            None if coolant is None else _ptr(coolant), None if flags is None else _ptr(flags), _ptr(out),
+        )  # fmt: skip
+        return out
 
     @property
     def counters(self) -> Counters:
