@@ -96,7 +96,7 @@ def test_lab_has_interfaces_directory_environment_and_arguments(working_lab, tmp
 
 
 def test_lab_passes_all_output_and_separates_it(working_lab):
-    code = 'head -c 3000000 /dev/urandom | tee >(sha256sum >&2)'
+    code = 'f=$(mktemp); head -c 3000000 /dev/urandom >"$f"; sha256sum <"$f" >&2; cat "$f"; rm "$f"'
     done = lab("--", "bash", "-c", code)
     assert len(done.stdout) == 3_000_000
     assert hashlib.sha256(done.stdout).hexdigest() == done.stderr.split()[0].decode()
