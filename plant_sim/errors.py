@@ -15,3 +15,7 @@ class CycleError(PlantError):
 
 class PlantStateError(PlantError):
     """The plant was asked for something that its state does not allow."""
+
+
+class FaultError(PlantError):
+    """A sensor fault is not understood, impossible, or in conflict with another one."""

@@ -5,6 +5,7 @@ Pure core: no clock, no socket, no file beyond parameters and cycle at construct
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,8 +14,9 @@ from numpy.typing import NDArray
 
 from plant_sim.cycles import Cycle, CycleSpec, build_cycle
 from plant_sim.errors import PlantStateError
+from plant_sim.faults import Fault, active_faults
 from plant_sim.lptn import DT_S
-from plant_sim.nodes import HOT_SPOT, N_NODES, THETA_R, THETA_W
+from plant_sim.nodes import AMBIENT, COOLANT, HOT_SPOT, N_NODES, THETA_R, THETA_W
 from plant_sim.params import PlantParams
 from plant_sim.sensors import TemperatureSensor
 from plant_sim.state import (
@@ -32,6 +34,9 @@ from plant_sim.state import (
 
 TICKS_PER_SAMPLE = 10
 NO_RULE = (0.0, 0.0)
+KEY_ON_MAX_S = 600.0
+SOAKED_WITHIN_K = 0.5
+STANDSTILL = Cycle("standstill", False, 1.0, np.zeros(2), np.zeros(2))
 Engine = Literal["numba", "numpy"]
 
 
@@ -49,7 +54,13 @@ class PlantSample:
     done
         Whether the cycle's end has been reached.
     theta_w_meas_degc, theta_r_meas_degc
-        Sensor readings at every tenth tick, else None.
+        Sensor readings at every tenth tick, else None; NaN: the sensor gives no value.
+    coolant_degc, ambient_degc
+        What flows in and what is around.
+    soaked
+        Whether the whole machine has stood long enough to have the coolant's temperature: key-on only.
+    fault_w, fault_r
+        Truth: bit masks of the sensor faults at this tick, see `plant_sim.faults.KINDS`.
     """
 
     tick: int
@@ -65,6 +76,11 @@ class PlantSample:
     done: bool
     theta_w_meas_degc: float | None = None
     theta_r_meas_degc: float | None = None
+    coolant_degc: float = np.nan
+    ambient_degc: float = np.nan
+    soaked: bool = False
+    fault_w: int = 0
+    fault_r: int = 0
 
 
 class Plant:
@@ -83,6 +99,11 @@ class Plant:
         Seed of the sensor noise.
     engine
         ``numba`` (compiled) or ``numpy`` (the readable reference); both give the same run within rounding.
+    faults
+        What is wrong with the sensors, when; times count from the plant's start.
+    key_on_s
+        Standstill before the cycle: no speed, no torque, coolant running. Ticks count through it from 0, the cycle's
+        own time starts behind it.
     """
 
     def __init__(
@@ -92,12 +113,18 @@ class Plant:
         theta0_degc: float | NDArray[np.float64] | None = None,
         seed: int = 0,
         engine: Engine = "numba",
+        faults: Sequence[Fault] = (),
+        key_on_s: float = 0.0,
     ) -> None:
         if theta0_degc is None:
             theta0_degc = cycle.theta0_degc if isinstance(cycle, CycleSpec) else 60.0
         self.params = params
         self.cycle = build_cycle(cycle, params) if isinstance(cycle, CycleSpec) else cycle
         self._engine = _make_engine(engine, params, self.cycle)
+        self._key_on_ticks = round(key_on_s / DT_S)
+        if not 0.0 <= key_on_s <= KEY_ON_MAX_S or abs(self._key_on_ticks * DT_S - key_on_s) > 1e-6:
+            raise PlantStateError(f"key-on of {key_on_s} s: give 0 to {KEY_ON_MAX_S:g} s in steps of {DT_S} s")
+        self._standing = _make_engine(engine, params, STANDSTILL) if self._key_on_ticks else self._engine
         self._theta = np.array(np.broadcast_to(np.asarray(theta0_degc, dtype=float), (N_NODES,)))
         if not np.isfinite(self._theta).all():
             raise PlantStateError("start temperature is not finite; give degC for all nodes")
@@ -105,7 +132,11 @@ class Plant:
         self._tick = 0
         b = params.boundary
         self._boundary = np.array([b.coolant_degc, b.ambient_degc, b.gearbox_degc])
-        self._sensor = TemperatureSensor(params.sensor, self._theta_pair(), np.random.default_rng([seed, 61]))
+        self._soaked = bool(np.all(np.abs(self._theta - b.coolant_degc) <= SOAKED_WITHIN_K))
+        self.faults = tuple(faults)
+        self._sensor = TemperatureSensor(
+            params.sensor, self._theta_pair(), np.random.default_rng([seed, 61]), self.faults
+        )
 
     @property
     def tick(self) -> int:
@@ -125,7 +156,17 @@ class Plant:
     @property
     def done(self) -> bool:
         """Whether the cycle's end has been reached."""
-        return self.cycle.done(self._tick * DT_S, float(self._state[X]))
+        driven = self._tick - self._key_on_ticks
+        return driven > 0 and self.cycle.done(driven * DT_S, float(self._state[X]))
+
+    @property
+    def soaked(self) -> bool:
+        """Whether this is the standstill at key-on, started at the coolant's temperature."""
+        return self._soaked and self._tick <= self._key_on_ticks
+
+    def active_faults(self, t_s: float) -> tuple[int, int]:
+        """Bit masks (winding, rotor) of the sensor faults at a time (s since the plant's start)."""
+        return active_faults(self.faults, t_s)
 
     def set_boundary(self, coolant_degc: float, ambient_degc: float, gearbox_degc: float) -> None:
         """Change the surroundings from the next step on."""
@@ -143,7 +184,8 @@ class Plant:
         """
         row, measured = self._advance(1, derate, NO_RULE, False)
         r = row[0]
-        meas = measured[0] if measured.size else (None, None)
+        meas_w, meas_r = measured[0].tolist() if measured.size else (None, None)
+        fault_w, fault_r = self.active_faults(self._tick * DT_S)
         return PlantSample(
             self._tick,
             self._tick * DT_S,
@@ -156,7 +198,13 @@ class Plant:
             float(r[ROW_THETA_W]),
             float(r[ROW_THETA_R]),
             self.done,
-            *(None if m is None else float(m) for m in meas),
+            meas_w,
+            meas_r,
+            float(self._boundary[COOLANT]),
+            float(self._boundary[AMBIENT]),
+            self.soaked,
+            fault_w,
+            fault_r,
         )
 
     def advance(self, seconds: float, derate: float = 1.0) -> None:
@@ -180,13 +228,21 @@ class Plant:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if not 0.0 <= derate <= 1.0:
             raise PlantStateError(f"derating factor {derate} is outside 0..1")
-        rows = self._engine.run(
-            ticks, self._tick, self._state, self._theta, self._boundary, derate, rule, stop
-        )
+        standing = min(max(self._key_on_ticks - self._tick, 0), ticks)
+        rows = self._run(self._standing, standing, self._tick, derate, rule, False)
+        if ticks > standing or not standing:
+            driven = self._tick + standing - self._key_on_ticks
+            moving = self._run(self._engine, ticks - standing, driven, derate, rule, stop)
+            rows = np.concatenate([rows, moving]) if standing else moving
         first = -(self._tick + 1) % TICKS_PER_SAMPLE
         self._tick += rows.shape[0]
         due = rows[first::TICKS_PER_SAMPLE, ROW_THETA_W : ROW_THETA_R + 1]
         return rows, self._sensor.sample(due) if due.size else due
+
+    def _run(
+        self, engine, ticks: int, tick: int, derate: float, rule: tuple[float, float], stop: bool
+    ) -> NDArray[np.float64]:
+        return engine.run(ticks, tick, self._state, self._theta, self._boundary, derate, rule, stop)
 
     def _theta_pair(self) -> NDArray[np.float64]:
         t = self._theta
