@@ -1,0 +1,72 @@
+"""The net corrected by one constant gain per channel, delay-aware, datasheet offset removed; and the net alone.
+
+theta(k) += K (y - offset - theta(k)) at the node the measurement speaks for, then the net forward to now with the
+stored inputs. Gain 0 is the open loop: started from the first 1.5 s of measurements, never corrected. The gains come
+from training-type drives (`tune.py`), never from the lap.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from tools.estimators.drive import DELAY_STEPS, OFFSET_DEGC, Drive, Estimates
+from tools.estimators.net import Net, memory_size, scratch_size, step
+from tools.estimators.session import ArraySession
+from tools.estimators.start import EARLY, SPIN_UP_STEPS, begins
+
+Array = NDArray[np.float64]
+
+
+class FixedGain:
+    """Estimator of drive.Estimator.
+
+    Parameters
+    ----------
+    gain
+        Per channel; 0 for the open loop.
+    gate_degc
+        Innovations beyond this are not used; inf: the textbook's observer, which uses all.
+    """
+
+    def __init__(self, name: str, net: Net, gain: tuple[float, float], gate_degc: tuple[float, float]) -> None:
+        self.name, self._net = name, net
+        self._gain, self._gate = np.array(gain), np.array(gate_degc)
+
+    def begin(self) -> ArraySession:
+        return ArraySession(np.zeros(EARLY + 2 + memory_size(self._net)), 2, self._loop)
+
+    def read(self, rows: Array) -> Estimates:
+        return Estimates(rows)
+
+    def _loop(self, memory: Array, drive: Drive, first: int, last: int, out: Array) -> None:
+        scratch = np.empty(scratch_size(self._net))
+        _observe(self._net, self._gain, self._gate, memory, drive.u, drive.y, first, last, scratch, out)
+
+
+@njit(cache=True)
+def _observe(net, gain, gate, memory, u, y, first, last, scratch, out):
+    early, state = memory[:EARLY], memory[EARLY:]
+    ahead = np.empty_like(state)
+    for row in range(first, last):
+        node = row - DELAY_STEPS
+        if early[4] == 0.0:
+            if not begins(early, y[row], row):
+                continue
+            for ch in range(2):
+                state[ch] = early[ch] / early[2 + ch]
+            start_w, start_r = state[0], state[1]
+            for _ in range(SPIN_UP_STEPS):
+                step(net, u[node + 1], state, scratch)
+                state[0], state[1] = start_w, start_r
+        else:
+            step(net, u[node], state, scratch)
+        for ch in range(2):
+            innovation = y[row, ch] - OFFSET_DEGC - state[ch]
+            if abs(innovation) <= gate[ch]:  # false for NaN too
+                state[ch] += gain[ch] * innovation
+        ahead[:] = state
+        for k in range(node + 1, row + 1):
+            step(net, u[k], ahead, scratch)
+        out[row - first, 0], out[row - first, 1] = ahead[0], ahead[1]
