@@ -23,7 +23,7 @@ IRON_START_VARIANCE_K2 = 400.0
 
 
 class LptnKf:
-    """Estimator of drive.Estimator; publishes the standard deviation at the delayed node.
+    """Estimator of drive.Estimator.
 
     Parameters
     ----------
@@ -43,10 +43,10 @@ class LptnKf:
         self._heats: tuple[Array, Array] | None = None  # of the drive worked on last: (u, heats)
 
     def begin(self) -> ArraySession:
-        return ArraySession(np.zeros(EARLY + NODES + NODES * NODES), 4, self._loop)
+        return ArraySession(np.zeros(EARLY + NODES + NODES * NODES), 2, self._loop)
 
     def read(self, rows: Array) -> Estimates:
-        return Estimates(rows[:, :2].copy(), sigma_degc=rows[:, 2:].copy())
+        return Estimates(rows)
 
     def _loop(self, memory: Array, drive: Drive, first: int, last: int, out: Array) -> None:
         if self._heats is None or self._heats[0] is not drive.u:
@@ -82,7 +82,4 @@ def _filter(network, q, r, gate, memory, u, heat, y, first, last, out):
         ahead[:] = theta
         for k in range(node + 1, row + 1):
             lptn.step(network, u[k, 0], heat[k], ahead, slope)
-        for ch in range(2):
-            at = 0 if ch == 0 else ROTOR
-            out[row - first, ch] = ahead[at]
-            out[row - first, 2 + ch] = np.sqrt(cov[at, at])
+        out[row - first, 0], out[row - first, 1] = ahead[0], ahead[ROTOR]

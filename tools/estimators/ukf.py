@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 class Ukf:
-    """Estimator of drive.Estimator; publishes the standard deviation at the delayed node.
+    """Estimator of drive.Estimator.
 
     Parameters
     ----------
@@ -39,10 +39,10 @@ class Ukf:
 
     def begin(self) -> ArraySession:
         n = 2 + memory_size(self._net)
-        return ArraySession(np.zeros(EARLY + n + n * n), 4, self._loop)
+        return ArraySession(np.zeros(EARLY + n + n * n), 2, self._loop)
 
     def read(self, rows: Array) -> Estimates:
-        return Estimates(rows[:, :2].copy(), sigma_degc=rows[:, 2:].copy())
+        return Estimates(rows)
 
     def _loop(self, memory: Array, drive: Drive, first: int, last: int, out: Array) -> None:
         scratch = np.empty(scratch_size(self._net))
@@ -81,7 +81,6 @@ def _filter(net, q, r, gate, memory, u, y, first, last, scratch, out):
             step(net, u[k], ahead, scratch)
         for ch in range(2):
             out[row - first, ch] = ahead[ch]
-            out[row - first, 2 + ch] = np.sqrt(cov[ch, ch])
 
 
 @njit(cache=True)
