@@ -3,9 +3,10 @@
 #include <math.h>
 #include <string.h>
 
-_Static_assert(sizeof(est_bus) <= 75000, "est_bus.h says so");
+_Static_assert(sizeof(est_bus) <= 112000, "est_bus.h says so");
 
-static const enum drive_index RX_INDEX[EST_RX_COUNT] = {DRIVE_INDEX_MOTOR_STATE, DRIVE_INDEX_TEMP_MEAS};
+static const enum drive_index RX_INDEX[EST_RX_COUNT] = {DRIVE_INDEX_MOTOR_STATE, DRIVE_INDEX_TEMP_MEAS,
+                                                        DRIVE_INDEX_COOLANT};
 
 static const int64_t NS_PER_MS = 1000000;
 
@@ -49,6 +50,41 @@ static bool decode_temp(const struct canfd_frame *frame, est_input *out) {
     return true;
 }
 
+static bool decode_coolant(const struct canfd_frame *frame, est_input *out) {
+    struct drive_coolant_t raw;
+    if (drive_coolant_unpack(&raw, frame->data, frame->len) != 0) {
+        return false;
+    }
+    out->id = EST_RX_COOLANT;
+    out->tick = raw.tick;
+    out->coolant.coolant_degc = drive_coolant_coolant_degc_to_phys(raw.coolant_degc);
+    out->coolant.soaked = raw.soaked != 0;
+    out->coolant.valid = !isnan(out->coolant.coolant_degc);
+    return true;
+}
+
+static bool decode(int id, const struct canfd_frame *frame, est_input *out) {
+    switch (id) {
+    case EST_RX_MOTOR_STATE:
+        return decode_motor(frame, out);
+    case EST_RX_TEMP_MEAS:
+        return decode_temp(frame, out);
+    default:
+        return decode_coolant(frame, out);
+    }
+}
+
+static bool complete(const est_input *input) {
+    switch (input->id) {
+    case EST_RX_MOTOR_STATE:
+        return input->motor.valid;
+    case EST_RX_TEMP_MEAS:
+        return input->temp.valid_w && input->temp.valid_r;
+    default:
+        return input->coolant.valid;
+    }
+}
+
 static int listened(canid_t id) {
     for (int i = 0; i < EST_RX_COUNT; i++) {
         if (drive_messages[RX_INDEX[i]].can_id == id) {
@@ -73,11 +109,11 @@ est_bus_verdict est_bus_accept(est_bus *self, const struct canfd_frame *frame, i
     if (!e2e_is_usable(e2e_check(&rx->e2e, frame->data, frame->len))) {
         return EST_BUS_IGNORED;
     }
-    if (!(id == EST_RX_MOTOR_STATE ? decode_motor(frame, out) : decode_temp(frame, out))) {
+    if (!decode(id, frame, out)) {
         self->rejected++;
         return EST_BUS_IGNORED;
     }
-    if (id == EST_RX_MOTOR_STATE ? !out->motor.valid : !(out->temp.valid_w && out->temp.valid_r)) {
+    if (!complete(out)) {
         rx->unavailable++;
     }
     self->accepted++;
@@ -106,7 +142,7 @@ bool est_bus_stale(est_bus *self, int64_t now_ns, uint64_t index) {
         rx->timeouts += stale && !rx->stale ? 1U : 0U;
         rx->stale = stale;
         rt_stats_add(&rx->age_ns, age_ns, index);
-        any = any || stale;
+        any = any || (stale && i != EST_RX_COOLANT);
     }
     return any;
 }
@@ -170,6 +206,30 @@ void est_bus_validity(est_bus *self, const est_output *in, struct canfd_frame *f
     raw.novelty = drive_est_validity_novelty_to_raw(validity->novelty);
     raw.tick = in->tick;
     SEAL(self, DRIVE_INDEX_EST_VALIDITY, est_validity, raw, frame);
+}
+
+void est_bus_winding(est_bus *self, const est_output *in, struct canfd_frame *frame) {
+    const estimator_channel_t *channel = &in->channel[0];
+    struct drive_est_winding_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.sensor_w_fault = drive_est_winding_sensor_w_fault_to_raw((double)channel->fault);
+    raw.sensor_w_trusted = channel->trusted ? 1U : 0U;
+    raw.sigma_w_degc = drive_est_winding_sigma_w_degc_to_raw(channel->sigma_degc);
+    raw.upper_w_degc = drive_est_winding_upper_w_degc_to_raw(channel->upper_degc);
+    raw.tick = in->tick;
+    SEAL(self, DRIVE_INDEX_EST_WINDING, est_winding, raw, frame);
+}
+
+void est_bus_rotor(est_bus *self, const est_output *in, struct canfd_frame *frame) {
+    const estimator_channel_t *channel = &in->channel[1];
+    struct drive_est_rotor_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.sensor_r_fault = drive_est_rotor_sensor_r_fault_to_raw((double)channel->fault);
+    raw.sensor_r_trusted = channel->trusted ? 1U : 0U;
+    raw.sigma_r_degc = drive_est_rotor_sigma_r_degc_to_raw(channel->sigma_degc);
+    raw.upper_r_degc = drive_est_rotor_upper_r_degc_to_raw(channel->upper_degc);
+    raw.tick = in->tick;
+    SEAL(self, DRIVE_INDEX_EST_ROTOR, est_rotor, raw, frame);
 }
 
 void est_bus_timing_a(est_bus *self, const est_timing *in, struct canfd_frame *frame) {
@@ -248,34 +308,53 @@ static void core_faults2(est_bus *self, const est_counters *in, struct canfd_fra
     SEAL(self, DRIVE_INDEX_EST_CORE_FAULTS2, est_core_faults2, raw, frame);
 }
 
-void est_bus_counters(est_bus *self, const est_counters *in, struct canfd_frame frames[EST_COUNTER_FRAMES]) {
-    releases(self, in, &frames[0]);
-    misses(self, in, &frames[1]);
-    input_faults(self, in, &frames[2]);
-    bus_faults(self, in, &frames[3]);
-    core_faults(self, in, &frames[4]);
-    core_faults2(self, in, &frames[5]);
+static void calibration(est_bus *self, const est_counters *in, struct canfd_frame *frame) {
+    const estimator_calibration_t *c = &in->calibration;
+    struct drive_est_calibration_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.calibration_state = drive_est_calibration_calibration_state_to_raw((double)c->state);
+    raw.offset_w_degc = drive_est_calibration_offset_w_degc_to_raw(c->offset_degc[0]);
+    raw.offset_r_degc = drive_est_calibration_offset_r_degc_to_raw(c->offset_degc[1]);
+    raw.offset_sigma_w_degc = drive_est_calibration_offset_sigma_w_degc_to_raw(c->sigma_degc[0]);
+    raw.offset_sigma_r_degc = drive_est_calibration_offset_sigma_r_degc_to_raw(c->sigma_degc[1]);
+    SEAL(self, DRIVE_INDEX_EST_CALIBRATION, est_calibration, raw, frame);
 }
 
-void est_bus_identity(est_bus *self, const est_identity *in, struct canfd_frame frames[EST_IDENTITY_FRAMES]) {
-    struct drive_est_identity_t identity;
-    memset(&identity, 0, sizeof identity);
-    identity.dbc_hash = drive_est_identity_dbc_hash_to_raw((double)in->dbc_hash);
-    identity.weights_hash = drive_est_identity_weights_hash_to_raw((double)in->weights_hash);
-    SEAL(self, DRIVE_INDEX_EST_IDENTITY, est_identity, identity, &frames[0]);
+void est_bus_counter(est_bus *self, size_t which, const est_counters *in, struct canfd_frame *frame) {
+    static void (*const make[EST_COUNTER_FRAMES])(est_bus *, const est_counters *, struct canfd_frame *) = {
+        releases, misses, input_faults, bus_faults, core_faults, core_faults2, calibration};
+    make[which](self, in, frame);
+}
 
-    struct drive_est_build_t build;
-    memset(&build, 0, sizeof build);
-    build.build_hash = drive_est_build_build_hash_to_raw((double)in->build_hash);
-    build.setting_id = drive_est_build_setting_id_to_raw((double)in->setting_id);
-    SEAL(self, DRIVE_INDEX_EST_BUILD, est_build, build, &frames[1]);
+static void hashes(est_bus *self, const est_identity *in, struct canfd_frame *frame) {
+    struct drive_est_identity_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.dbc_hash = drive_est_identity_dbc_hash_to_raw((double)in->dbc_hash);
+    raw.weights_hash = drive_est_identity_weights_hash_to_raw((double)in->weights_hash);
+    SEAL(self, DRIVE_INDEX_EST_IDENTITY, est_identity, raw, frame);
+}
 
-    struct drive_est_granted_t granted;
-    memset(&granted, 0, sizeof granted);
-    granted.policy = drive_est_granted_policy_to_raw((double)in->policy);
-    granted.priority = drive_est_granted_priority_to_raw((double)in->priority);
-    granted.core = drive_est_granted_core_to_raw(in->core < 0 ? (double)NAN : (double)in->core);
-    granted.mlock = in->mlock ? 1U : 0U;
-    granted.period_us = drive_est_granted_period_us_to_raw((double)in->period_us);
-    SEAL(self, DRIVE_INDEX_EST_GRANTED, est_granted, granted, &frames[2]);
+static void build(est_bus *self, const est_identity *in, struct canfd_frame *frame) {
+    struct drive_est_build_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.build_hash = drive_est_build_build_hash_to_raw((double)in->build_hash);
+    raw.setting_id = drive_est_build_setting_id_to_raw((double)in->setting_id);
+    SEAL(self, DRIVE_INDEX_EST_BUILD, est_build, raw, frame);
+}
+
+static void granted(est_bus *self, const est_identity *in, struct canfd_frame *frame) {
+    struct drive_est_granted_t raw;
+    memset(&raw, 0, sizeof raw);
+    raw.policy = drive_est_granted_policy_to_raw((double)in->policy);
+    raw.priority = drive_est_granted_priority_to_raw((double)in->priority);
+    raw.core = drive_est_granted_core_to_raw(in->core < 0 ? (double)NAN : (double)in->core);
+    raw.mlock = in->mlock ? 1U : 0U;
+    raw.period_us = drive_est_granted_period_us_to_raw((double)in->period_us);
+    SEAL(self, DRIVE_INDEX_EST_GRANTED, est_granted, raw, frame);
+}
+
+void est_bus_identity(est_bus *self, size_t which, const est_identity *in, struct canfd_frame *frame) {
+    static void (*const make[EST_IDENTITY_FRAMES])(est_bus *, const est_identity *, struct canfd_frame *) = {
+        hashes, build, granted};
+    make[which](self, in, frame);
 }

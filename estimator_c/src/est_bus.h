@@ -11,15 +11,16 @@
 
 #include <linux/can.h>
 #include <stdbool.h>
+#include <stddef.h>
 #include <stdint.h>
 
 #include "drive_e2e.h"
 #include "e2e.h"
+#include "estimator.h"
 #include "rt_stats.h"
-#include "validity.h"
 
 /* The messages the estimator listens to. */
-typedef enum { EST_RX_MOTOR_STATE = 0, EST_RX_TEMP_MEAS = 1, EST_RX_COUNT = 2 } est_rx_id;
+typedef enum { EST_RX_MOTOR_STATE = 0, EST_RX_TEMP_MEAS = 1, EST_RX_COOLANT = 2, EST_RX_COUNT = 3 } est_rx_id;
 
 /* Content of an accepted frame. A value that is not valid is NaN. */
 typedef struct {
@@ -37,6 +38,11 @@ typedef struct {
             bool valid_w;
             bool valid_r;
         } temp;
+        struct {
+            double coolant_degc;
+            bool soaked; /* the machine has stood and all of it has the coolant's temperature */
+            bool valid;
+        } coolant;
     };
 } est_input;
 
@@ -51,14 +57,14 @@ typedef struct {
     bool alive;             /* a usable frame has been seen */
     bool stale;             /* older than HilTimeoutMs at the last est_bus_stale */
     uint64_t timeouts;      /* times it became stale */
-    uint64_t unavailable;   /* usable frames with a value not available */
+    uint64_t unavailable;   /* usable frames with a value not available that we use */
     uint16_t last_tick;     /* of the last usable frame */
     int64_t last_ns;        /* arrival of the last usable frame that brought news; MotorState: its tick had moved */
     rt_stats gap_ns;        /* between such frames */
     rt_stats age_ns;        /* of the newest such frame when a job looked */
 } est_rx;
 
-/* Up to 75 kB (checked where it is compiled): belongs in static storage. */
+/* Up to 112 kB (checked where it is compiled): belongs in static storage. */
 typedef struct {
     est_rx rx[EST_RX_COUNT];
     e2e_sender_t tx[DRIVE_MESSAGE_COUNT];
@@ -83,6 +89,7 @@ typedef struct {
     double innov_w_degc;
     double innov_r_degc;
     validity_result_t validity;
+    estimator_channel_t channel[MHE_CHANNELS];
 } est_output;
 
 typedef struct {
@@ -97,13 +104,14 @@ typedef struct {
     int64_t resp_ns;
 } est_timing;
 
-/* Counters as published; each saturates at its last valid code. */
+/* Counters as published, and the calibration that goes with them; each saturates at its last valid code. */
 typedef struct {
     uint64_t releases, jobs, miss_late, miss_skipped, overrun;
     uint64_t crc_errors, seq_errors, stale_inputs;
     uint64_t rx_drops, tx_drops, rejected;
     uint64_t restarts, held_intervals, late_measurements, stray_ticks;
     uint64_t off_grid, invalid_inputs, unconverged, repeated_ticks;
+    estimator_calibration_t calibration;
 } est_counters;
 
 typedef struct {
@@ -125,7 +133,9 @@ void est_bus_init(est_bus *self);
  * before is handed on, but does not keep the input alive: a sender whose model stands still grows stale. Under 1 µs. */
 est_bus_verdict est_bus_accept(est_bus *self, const struct canfd_frame *frame, int64_t at_ns, est_input *out);
 
-/* True if an input that has been alive is older than its timeout at `now_ns`; records the ages under release `index`. Call once per job, after the job's frames. An input never seen yet is not stale: there is nothing to be late. */
+/* True if an input that has been alive is older than its timeout at `now_ns`; records the ages under release `index`. Call
+ * once per job, after the job's frames. An input never seen yet is not stale: there is nothing to be late. Coolant frames are
+ * of use at key-on alone: one that is late counts as a timeout of that message, but does not make the input stale. */
 bool est_bus_stale(est_bus *self, int64_t now_ns, uint64_t index);
 
 /* Whether this input was stale at the last est_bus_stale. O(1). */
@@ -141,13 +151,16 @@ void est_bus_read_faults(const est_bus *self, est_bus_faults *out);
 void est_bus_estimate(est_bus *self, const est_output *in, struct canfd_frame *frame);
 void est_bus_innov(est_bus *self, const est_output *in, struct canfd_frame *frame);
 void est_bus_validity(est_bus *self, const est_output *in, struct canfd_frame *frame);
+void est_bus_winding(est_bus *self, const est_output *in, struct canfd_frame *frame);
+void est_bus_rotor(est_bus *self, const est_output *in, struct canfd_frame *frame);
 void est_bus_timing_a(est_bus *self, const est_timing *in, struct canfd_frame *frame);
 void est_bus_timing_b(est_bus *self, const est_timing *in, struct canfd_frame *frame);
 
-enum { EST_COUNTER_FRAMES = 6, EST_IDENTITY_FRAMES = 3 };
-/* EstReleases, EstMisses, EstInputFaults, EstBusFaults, EstCoreFaults, EstCoreFaults2. */
-void est_bus_counters(est_bus *self, const est_counters *in, struct canfd_frame frames[EST_COUNTER_FRAMES]);
-/* EstIdentity, EstBuild, EstGranted. */
-void est_bus_identity(est_bus *self, const est_identity *in, struct canfd_frame frames[EST_IDENTITY_FRAMES]);
+enum { EST_COUNTER_FRAMES = 7, EST_IDENTITY_FRAMES = 3 };
+/* Frame `which` (below EST_COUNTER_FRAMES) of EstReleases, EstMisses, EstInputFaults, EstBusFaults, EstCoreFaults,
+ * EstCoreFaults2, EstCalibration. */
+void est_bus_counter(est_bus *self, size_t which, const est_counters *in, struct canfd_frame *frame);
+/* Frame `which` (below EST_IDENTITY_FRAMES) of EstIdentity, EstBuild, EstGranted. */
+void est_bus_identity(est_bus *self, size_t which, const est_identity *in, struct canfd_frame *frame);
 
 #endif

@@ -1,5 +1,6 @@
 #include "est_cycle.h"
 
+#include <math.h>
 #include <stddef.h>
 #include <string.h>
 
@@ -40,6 +41,9 @@ est_cycle_status est_cycle_init(est_cycle *self, const rt_task_config *config, c
     est_bus_init(&self->bus);
     self->io = *io;
     self->identity = *identity;
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) { /* nothing is known before the first job */
+        self->calibration.offset_degc[ch] = self->calibration.sigma_degc[ch] = (double)NAN;
+    }
     set_due(self, config->t0_ns);
     return EST_CYCLE_OK;
 }
@@ -54,9 +58,12 @@ void est_cycle_start_grid(est_cycle *self) {
 static void feed(estimator_t *estimator, const est_input *input) {
     if (input->id == EST_RX_MOTOR_STATE) {
         estimator_feed_motor(estimator, input->tick, input->motor.torque_nm, input->motor.speed_rpm, input->motor.valid);
-    } else {
+    } else if (input->id == EST_RX_TEMP_MEAS) {
         estimator_feed_temp(estimator, input->tick, input->temp.theta_w_degc, input->temp.theta_r_degc,
                             input->temp.valid_w, input->temp.valid_r);
+    } else {
+        estimator_feed_coolant(estimator, input->tick, input->coolant.coolant_degc, input->coolant.soaked,
+                               input->coolant.valid);
     }
 }
 
@@ -80,9 +87,14 @@ static est_cycle_status read_inputs(est_cycle *self) {
     return EST_CYCLE_OK;
 }
 
+static bool estimates(estimator_status_t status) {
+    return status == ESTIMATOR_RUNNING || status == ESTIMATOR_PREDICTING || status == ESTIMATOR_OPEN_LOOP ||
+           status == ESTIMATOR_FALLBACK;
+}
+
 static est_output output_of(const estimator_out_t *out, bool motor_stale) {
     estimator_status_t status = out->status;
-    if (motor_stale && (status == ESTIMATOR_RUNNING || status == ESTIMATOR_PREDICTING)) {
+    if (motor_stale && estimates(status)) {
         status = ESTIMATOR_INPUT_STALE; /* the core knows ticks only; that none comes any more, the bus knows */
     }
     const est_output output = {
@@ -94,6 +106,7 @@ static est_output output_of(const estimator_out_t *out, bool motor_stale) {
         .innov_w_degc = out->innov_w_degc,
         .innov_r_degc = out->innov_r_degc,
         .validity = out->validity,
+        .channel = {out->channel[0], out->channel[1]},
     };
     return output;
 }
@@ -119,10 +132,12 @@ static est_cycle_status publish(est_cycle *self, const est_output *output, bool 
     if (status == EST_IO_GONE) {
         return EST_CYCLE_GONE;
     }
-    struct canfd_frame more[2];
+    struct canfd_frame more[4];
     est_bus_innov(&self->bus, output, &more[0]);
     est_bus_validity(&self->bus, output, &more[1]);
-    return send_all(self, more, 2);
+    est_bus_winding(&self->bus, output, &more[2]);
+    est_bus_rotor(&self->bus, output, &more[3]);
+    return send_all(self, more, 4);
 }
 
 static est_cycle_status publish_timing(est_cycle *self, const rt_job *job, bool stale) {
@@ -170,6 +185,7 @@ void est_cycle_counters(const est_cycle *self, est_counters *out) {
         .invalid_inputs = core->invalid_inputs,
         .unconverged = core->unconverged,
         .repeated_ticks = core->repeated_ticks,
+        .calibration = self->calibration,
     };
     *out = counters;
 }
@@ -178,7 +194,9 @@ est_cycle_status est_cycle_send_final(est_cycle *self) {
     est_counters counters;
     struct canfd_frame frames[EST_COUNTER_FRAMES];
     est_cycle_counters(self, &counters);
-    est_bus_counters(&self->bus, &counters, frames);
+    for (size_t i = 0; i < EST_COUNTER_FRAMES; i++) {
+        est_bus_counter(&self->bus, i, &counters, &frames[i]);
+    }
     return send_all(self, frames, EST_COUNTER_FRAMES);
 }
 
@@ -187,23 +205,35 @@ static int64_t next_due(int64_t due_ns, int64_t every_ns, int64_t now_ns) {
     return due_ns + ((now_ns - due_ns) / every_ns + 1) * every_ns;
 }
 
-static est_cycle_status housekeeping(est_cycle *self, const rt_job *job) {
-    /* Where both are due the counters go first and the identity with the next job, whatever is due then. */
-    const bool counters_due = job->release_ns >= self->next_counters_ns;
-    const bool identity_due = job->release_ns >= self->next_identity_ns;
-    if (counters_due && !(identity_due && self->identity_waits)) {
-        self->next_counters_ns = next_due(self->next_counters_ns, NS_PER_S, job->release_ns);
-        self->identity_waits = identity_due;
-        return est_cycle_send_final(self);
+/* Begins a round with what is due. Counters are taken once for all of its frames, so that they fit together. */
+static void begin_round(est_cycle *self, int64_t release_ns) {
+    const bool counters_due = release_ns >= self->next_counters_ns;
+    const bool identity_due = release_ns >= self->next_identity_ns;
+    if (counters_due) {
+        self->next_counters_ns = next_due(self->next_counters_ns, NS_PER_S, release_ns);
+        est_cycle_counters(self, &self->round);
     }
     if (identity_due) {
-        self->next_identity_ns = next_due(self->next_identity_ns, IDENTITY_EVERY_S * NS_PER_S, job->release_ns);
-        self->identity_waits = false;
-        struct canfd_frame frames[EST_IDENTITY_FRAMES];
-        est_bus_identity(&self->bus, &self->identity, frames);
-        return send_all(self, frames, EST_IDENTITY_FRAMES);
+        self->next_identity_ns = next_due(self->next_identity_ns, IDENTITY_EVERY_S * NS_PER_S, release_ns);
     }
-    return EST_CYCLE_OK;
+    self->round_next = counters_due ? 0 : EST_COUNTER_FRAMES;
+    self->round_end = EST_COUNTER_FRAMES + (identity_due ? (size_t)EST_IDENTITY_FRAMES : 0);
+}
+
+static est_cycle_status housekeeping(est_cycle *self, const rt_job *job) {
+    struct canfd_frame frames[EST_CYCLE_HOUSEKEEPING_FRAMES];
+    size_t count = 0;
+    if (self->round_next == self->round_end) {
+        begin_round(self, job->release_ns);
+    }
+    for (; count < EST_CYCLE_HOUSEKEEPING_FRAMES && self->round_next < self->round_end; self->round_next++) {
+        if (self->round_next < EST_COUNTER_FRAMES) {
+            est_bus_counter(&self->bus, self->round_next, &self->round, &frames[count++]);
+        } else {
+            est_bus_identity(&self->bus, self->round_next - EST_COUNTER_FRAMES, &self->identity, &frames[count++]);
+        }
+    }
+    return send_all(self, frames, count);
 }
 
 static est_cycle_status run(est_cycle *self, rt_job *job) {
@@ -217,6 +247,7 @@ static est_cycle_status run(est_cycle *self, rt_job *job) {
     estimator_step(&self->estimator, &out);
     const bool stale = bus_stale || out.stale_input;
     self->stale_jobs += stale ? 1U : 0U;
+    self->calibration = out.calibration;
     const est_output output = output_of(&out, est_bus_is_stale(&self->bus, EST_RX_MOTOR_STATE));
     rt_task_stepped(&self->task, job);
     /* A job that finds the bus gone still ends in good order: every started job is accounted for. */

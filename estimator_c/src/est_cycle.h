@@ -2,10 +2,12 @@
  *
  *     frames → est_bus (E2E, decode) → estimator → est_bus (encode, E2E) → frames
  *
- * Frames leave in this order: Estimate, EstimateInnov, EstValidity, then (response time known) EstTimingA, EstTimingB;
- * once a second of release time the six counter frames; with the first job and every ten seconds the three identity
- * frames, but never in one job with the counters: at most eleven frames leave together (EST_CYCLE_FRAMES_PER_JOB), what
- * the send queue of a CAN interface (10) and its controller (1) take.
+ * Frames leave in this order: Estimate, EstimateInnov, EstValidity, EstWinding, EstRotor, then (response time known)
+ * EstTimingA, EstTimingB, then housekeeping: once a second of release time the seven counter frames, with the first job and
+ * every ten seconds the three identity frames behind them. Housekeeping is a queue of which a job sends at most four frames,
+ * so that no more than eleven leave together (EST_CYCLE_FRAMES_PER_JOB), what the send queue of a CAN interface (10) and its
+ * controller (1) take. The counters of one round are all from the moment it began; the next round waits for its end, so
+ * with fewer than two jobs a second they come less often.
  * No allocation, no lock, no printing. One thread; the caller owns the object. */
 #ifndef EST_CYCLE_H
 #define EST_CYCLE_H
@@ -20,7 +22,11 @@
 
 enum { EST_CYCLE_MAX_FRAMES = 4096 }; /* frames one job reads at most; the rest waits for the next job */
 
-enum { EST_CYCLE_FRAMES_PER_JOB = 5 + EST_COUNTER_FRAMES }; /* most that one job sends */
+enum {
+    EST_CYCLE_JOB_FRAMES = 7,          /* that every job sends */
+    EST_CYCLE_HOUSEKEEPING_FRAMES = 4, /* at most, beside them */
+    EST_CYCLE_FRAMES_PER_JOB = EST_CYCLE_JOB_FRAMES + EST_CYCLE_HOUSEKEEPING_FRAMES
+};
 
 typedef enum {
     EST_CYCLE_OK = 0,
@@ -39,7 +45,10 @@ typedef struct {
     est_identity identity;
     int64_t next_counters_ns;   /* release time from which the counters are due */
     int64_t next_identity_ns;
-    bool identity_waits;        /* the job before sent counters instead */
+    est_counters round;         /* counters of the housekeeping round under way */
+    size_t round_next;          /* its next frame: counters first, then identity */
+    size_t round_end;           /* none left when round_next has come here */
+    estimator_calibration_t calibration; /* of the newest job */
     uint64_t stale_jobs;        /* jobs made without fresh input */
     uint64_t estimates_sent;    /* jobs = estimates_sent + estimates_lost */
     uint64_t estimates_lost;
@@ -63,7 +72,7 @@ est_cycle_status est_cycle_run_released(est_cycle *self);
 /* The counters as they are published. O(1). */
 void est_cycle_counters(const est_cycle *self, est_counters *out);
 
-/* Sends the six counter frames once more, after the last job. */
+/* Sends the seven counter frames once more, after the last job. */
 est_cycle_status est_cycle_send_final(est_cycle *self);
 
 #endif

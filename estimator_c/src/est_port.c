@@ -93,6 +93,7 @@ est_io est_port_io(est_port *self, can_port_t *port) {
         const struct can_filter wanted[] = {
             {drive_messages[DRIVE_INDEX_MOTOR_STATE].can_id, CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG},
             {drive_messages[DRIVE_INDEX_TEMP_MEAS].can_id, CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG},
+            {drive_messages[DRIVE_INDEX_COOLANT].can_id, CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG},
         };
         (void)can_port_filter(port, wanted, sizeof wanted / sizeof wanted[0]);
     }
@@ -101,7 +102,7 @@ est_io est_port_io(est_port *self, can_port_t *port) {
 }
 
 int est_port_short_of(const est_port *self, int64_t period_us) {
-    const int64_t frames = EST_CYCLE_FRAMES_PER_JOB + 5 * INT64_C(1000000) / period_us;
+    const int64_t frames = EST_CYCLE_FRAMES_PER_JOB + EST_CYCLE_JOB_FRAMES * INT64_C(1000000) / period_us;
     const int64_t lacking = frames * QUEUED_FRAME_BYTES - self->send_buffer_bytes;
     return self->send_buffer_bytes > 0 && lacking > 0 ? (int)lacking : 0;
 }

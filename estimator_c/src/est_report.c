@@ -154,7 +154,8 @@ static void put_list(FILE *out, const char *name, const uint64_t *values, const 
 void est_report_final(FILE *out, const est_cycle *cycle, const est_report_run *run, rt_stats *scratch) {
     static const char *const cause_names[] = {"none",         "late_wake",   "preempted",
                                               "long_compute", "stale_input", "blocked_send"};
-    static const char *const status_names[] = {"init", "starting", "ok", "predicting", "input_stale", "invalid"};
+    static const char *const status_names[] = {"init", "starting", "ok", "predicting",
+                                               "input_stale", "invalid", "open_loop", "fallback"};
     est_counters counters;
     est_io_counters io;
     est_cycle_counters(cycle, &counters);
@@ -187,6 +188,8 @@ void est_report_final(FILE *out, const est_cycle *cycle, const est_report_run *r
     put_rx(out, &cycle->bus.rx[EST_RX_MOTOR_STATE], drive_messages[DRIVE_INDEX_MOTOR_STATE].name);
     (void)fputc(',', out);
     put_rx(out, &cycle->bus.rx[EST_RX_TEMP_MEAS], drive_messages[DRIVE_INDEX_TEMP_MEAS].name);
+    (void)fputc(',', out);
+    put_rx(out, &cycle->bus.rx[EST_RX_COOLANT], drive_messages[DRIVE_INDEX_COOLANT].name);
     (void)fputc('}', out);
     put_environment(out, run);
     (void)fputs("}\n", out);

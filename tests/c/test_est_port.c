@@ -191,7 +191,7 @@ static void a_second_of_frames_fits_where_it_is_said_to(void) {
     }
     CHECK(state.send_buffer_bytes > 0);
     for (size_t i = 0; i < sizeof periods_us / sizeof periods_us[0]; i++) {
-        const int64_t needed = EST_CYCLE_FRAMES_PER_JOB + 5000000 / periods_us[i];
+        const int64_t needed = EST_CYCLE_FRAMES_PER_JOB + EST_CYCLE_JOB_FRAMES * 1000000 / periods_us[i];
         CHECK(est_port_short_of(&state, periods_us[i]) > 0 || fit >= needed);
     }
     state.send_buffer_bytes = 212992; /* the kernel's default */

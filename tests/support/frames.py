@@ -17,6 +17,11 @@ GOLDEN: list[tuple[str, dict[str, float], str]] = [
     ),
     ("Reference", {"speed_demand_mps": 16.383, "slope_rad": 0.0, "tick": 49151.0}, "0d01ff3f0000ffbf"),
     (
+        "Coolant",
+        {"soaked": 1.0, "coolant_degc": 155.984375, "ambient_degc": 411.984375, "tick": 49151.0},
+        "4411ff3fff7fffbf",
+    ),
+    (
         "Estimate",
         {"status": 1.0, "theta_w_est_degc": 52.39453125, "theta_r_est_degc": 103.59375, "tick": 52428.0},
         "751165669899cccc",
@@ -39,6 +44,28 @@ GOLDEN: list[tuple[str, dict[str, float], str]] = [
             "tick": 52428.0,
         },
         "e55105005555cccc",
+    ),
+    (
+        "EstWinding",
+        {
+            "sensor_w_fault": 5.0,
+            "sensor_w_trusted": 1.0,
+            "sigma_w_degc": 16.383,
+            "upper_w_degc": 77.99609375,
+            "tick": 49151.0,
+        },
+        "d9d1ff3fff7fffbf",
+    ),
+    (
+        "EstRotor",
+        {
+            "sensor_r_fault": 2.0,
+            "sensor_r_trusted": 0.0,
+            "sigma_r_degc": 32.767,
+            "upper_r_degc": 13.99609375,
+            "tick": 52428.0,
+        },
+        "2921ff7fff3fcccc",
     ),
     (
         "EstTimingA",
@@ -68,11 +95,27 @@ GOLDEN: list[tuple[str, dict[str, float], str]] = [
         "33b1ff3fff7fffbf",
     ),
     (
+        "EstCalibration",
+        {
+            "calibration_state": 2.0,
+            "offset_w_degc": 63.99609375,
+            "offset_r_degc": -64.0,
+            "offset_sigma_w_degc": 0.425,
+            "offset_sigma_r_degc": 0.85,
+        },
+        "ff21ff3f00c055aa",
+    ),
+    (
         "TruthTemp",
         {"theta_w_true_degc": 27.998046875, "theta_r_true_degc": 155.998046875, "tick": 49151.0},
         "16f1ffcfff7fffbf",
     ),
     ("TruthVehicle", {"v_true_mps": 16.383, "distance_m": 52428.7, "tick": 49151.0}, "56f1fff3ff7fffbf"),
+    (
+        "TruthFault",
+        {"fault_w": 341.0, "fault_r": 170.0, "tick": 49151.0},
+        "01015501aa00ffbf",
+    ),
     ("PlantStatus", {"ticks_late": 16383.0, "late_max_ms": 3276.7, "tx_retries": 49151.0}, "5901ff3fff7fffbf"),
     ("EstIdentity", {"dbc_hash": 5592405.0, "weights_hash": 11184810.0}, "c701555555aaaaaa"),
     ("EstBuild", {"build_hash": 5592405.0, "setting_id": 0.0}, "eb01555555000000"),

@@ -28,8 +28,10 @@ DBC = load_dbc()
 DBC_SHA256 = hashlib.sha256(DEFAULT_DBC.read_bytes()).hexdigest()
 MS = 1_000_000
 TICK_NS = 10 * MS
-PER_JOB = ("Estimate", "EstimateInnov", "EstValidity", "EstTimingA", "EstTimingB")
-COUNTERS = ("EstReleases", "EstMisses", "EstInputFaults", "EstBusFaults", "EstCoreFaults", "EstCoreFaults2")
+CONTENT = ("Estimate", "EstimateInnov", "EstValidity", "EstWinding", "EstRotor")  # what carries no timing
+PER_JOB = (*CONTENT, "EstTimingA", "EstTimingB")
+COUNTERS = ("EstReleases", "EstMisses", "EstInputFaults", "EstBusFaults", "EstCoreFaults", "EstCoreFaults2",
+            "EstCalibration")  # fmt: skip
 IDENTITY = ("EstIdentity", "EstBuild", "EstGranted")
 
 
@@ -63,11 +65,17 @@ class Plant:
         values = {"theta_w_meas_degc": 79.0 + tick * 1e-3, "theta_r_meas_degc": 69.0, "tick": tick % 65536}
         return bytes(self._encoder.encode("TempMeas", values | override).data)
 
+    def coolant(self, tick: int, **override) -> bytes:
+        values = {"soaked": 0, "coolant_degc": 65.0, "ambient_degc": 25.0, "tick": tick % 65536}
+        return bytes(self._encoder.encode("Coolant", values | override).data)
+
     def frames(self, tick: int) -> list[tuple[int, bytes]]:
         """What the plant sends at `tick`."""
         out = [(0x0A0, self.motor(tick))]
         if tick % 10 == 0:
             out.append((0x1A0, self.temp(tick)))
+        if tick % 100 == 0:
+            out.append((0x1C0, self.coolant(tick)))
         return out
 
 
@@ -118,7 +126,7 @@ class Run:
 
     def payload(self) -> list[tuple]:
         """Everything the estimator concluded: record time and content of the frames that carry no timing."""
-        return [(f.t_ns, f.name, f.data) for f in self.frames if f.name in ("Estimate", "EstimateInnov", "EstValidity")]
+        return [(f.t_ns, f.name, f.data) for f in self.frames if f.name in CONTENT]
 
 
 def _sort_lines(text: str) -> tuple[dict | None, dict | None, list[str]]:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from rt_runner.e2e import E2eStatus
 from rt_runner.records import END, TICK, Record
 from tests.timing.estimator_process import (
+    CONTENT,
     COUNTERS,
     IDENTITY,
     MS,
@@ -52,6 +53,31 @@ def check_validity_frames(said):
     assert {v["outside_joint"] for v in judged} == {0, 1}, "the drive crosses the limit"
 
 
+def housekeeping(period_ms: int, seconds: int) -> list[tuple[int, str]]:
+    """When (ms) which frame must leave: rounds of counters (each second) and identity (at start, each ten seconds).
+
+    Four frames a job, a round at a time; and the counters once more at the end.
+    """
+    out, queue, counters_due, identity_due = [], [], 1000, 0
+    for t in range(period_ms, seconds * 1000 + 1, period_ms):
+        if not queue:
+            if t >= counters_due:
+                queue, counters_due = list(COUNTERS), t - t % 1000 + 1000
+            if t >= identity_due:
+                queue, identity_due = [*queue, *IDENTITY], t - t % 10_000 + 10_000
+        out += [(t, name) for name in queue[:4]]
+        queue = queue[4:]
+    return out + [(seconds * 1000, name) for name in COUNTERS]
+
+
+def test_housekeeping_of_the_usual_period_is_what_the_documents_say():
+    times = housekeeping(100, 12)
+    assert [t for t, name in times if name == "EstReleases"] == [*range(1000, 12_001, 1000), 12_000]
+    assert [t for t, name in times if name == "EstCalibration"] == [*range(1100, 12_000, 1000), 12_000]
+    assert [t for t, name in times if name == "EstIdentity"] == [100, 10_100]
+    assert [t for t, name in times if name == "EstGranted"] == [100, 10_200]
+
+
 @pytest.mark.parametrize("period_ms", [100, 1, 10, 250, 1000])
 def test_one_estimate_per_job_and_everything_accounted_for(program, period_ms):
     seconds = 4 if period_ms < 10 else 12
@@ -67,25 +93,19 @@ def test_one_estimate_per_job_and_everything_accounted_for(program, period_ms):
     assert run.final["miss_skipped"] == 0
     assert {f.e2e for f in run.frames} == {E2eStatus.OK}, "a gap in a counter"
     assert run.controls == [*((t * TICK_NS, TICK) for t in range(seconds * 100 + 1)), (seconds * 1000 * MS, END)]
-    for n, (estimate, innov, validity, timing_a, timing_b) in enumerate(jobs, start=1):
+    for n, job in enumerate(jobs, start=1):
+        *contents, timing_a, timing_b = job
         assert timing_a.values["release_index"] == n
         assert timing_a.values["wake_lat_us"] is None, "nothing sleeps in lock-step"
         assert timing_a.values["warmup"] == (n <= warmup)
         assert timing_b.values["resp_us"] >= timing_b.values["exec_wall_us"] > 0
-        assert {f.t_ns for f in (estimate, innov, validity, timing_a, timing_b)} == {n * period_ms * MS}
+        assert {f.t_ns for f in job} == {n * period_ms * MS}
         # Releases run at TICK, when everything before has been delivered: the newest tick is the one in use.
-        assert estimate.values["tick"] == n * period_ms // 10
-        assert innov.values["tick"] == validity.values["tick"] == estimate.values["tick"]
-    # Counters once a second of release time, and at the end; identity with the first job and every ten seconds, but
-    # where both are due in the job after. With a job a second that job is the next counters', and they give way.
-    counted = [s for s in range(1, seconds + 1) if period_ms < 1000 or s not in (2, 11)]
-    for name in COUNTERS:
-        assert [f.t_ns for f in run.named(name)] == [s * 1000 * MS for s in [*counted, seconds]]
-    identified = [2000, 11_000] if period_ms == 1000 else [period_ms, 10_000 + period_ms]
-    if seconds < 10:
-        identified = identified[:1]
-    for name in IDENTITY:
-        assert [f.t_ns for f in run.named(name)] == [ms * MS for ms in identified]
+        assert {f.values["tick"] for f in contents} == {n * period_ms // 10}
+    kept = [(f.t_ns // MS, f.name) for f in run.frames if f.name in COUNTERS + IDENTITY]
+    assert kept == housekeeping(period_ms, seconds)
+    for releases, misses in zip(run.named("EstReleases"), run.named("EstMisses"), strict=True):
+        assert releases.values["releases"] == releases.values["jobs"] + misses.values["miss_skipped"]
     together = Counter(f.t_ns for f in run.frames if f.t_ns < seconds * 1000 * MS)
     assert max(together.values()) <= 11, "the send queue of a CAN interface and its controller"
     assert jobs[-1][0].values["status"] == OK
@@ -120,7 +140,7 @@ def test_same_input_same_bytes(release):
     records = drive(range(500))
     first, second = run_drive(release, records), run_drive(release, records)
     assert first.payload() == second.payload()
-    assert len(first.payload()) == 3 * 49
+    assert len(first.payload()) == len(CONTENT) * 49
 
 
 BASE = drive(range(301))
@@ -245,6 +265,21 @@ def test_silent_plant_makes_stale_inputs_and_is_seen_on_the_bus(program):
     assert run.named("Estimate")[-1].values["status"] == OK
 
 
+def test_coolant_frames_are_checked_and_their_absence_makes_nothing_stale(program):
+    records = [r for r in drive(range(1001)) if not (r.can_id == 0x1C0 and r.t_ns // TICK_NS >= 500)]
+    first = next(i for i, r in enumerate(records) if r.can_id == 0x1C0 and r.t_ns // TICK_NS == 300)
+    records[first] = records[first]._replace(data=bytes([records[first].data[0] ^ 1, *records[first].data[1:]]))
+    run = run_drive(program, records)
+    assert (run.status, run.errors) == (0, [])
+    coolant = run.final["rx"]["Coolant"]
+    assert (coolant["ok"], coolant["lost"], coolant["wrong_crc"], coolant["timeouts"]) == (3, 1, 1, 1)
+    assert (run.final["crc_errors"], run.final["seq_errors"], run.final["foreign"]) == (1, 1, 0)
+    assert run.final["stale_inputs"] == 0
+    assert not any(a.values["stale_input"] for *_, a, _ in per_job(run))
+    calibration = run.named("EstCalibration")[-1].values
+    assert calibration["offset_w_degc"] == calibration["offset_r_degc"] == pytest.approx(-1.0)
+
+
 def test_a_plant_that_sends_but_stands_still_is_stale(program):
     """Good counters and CRCs, the same tick for two seconds: the frames keep coming, news does not."""
     plant, records = Plant(), []
@@ -256,7 +291,7 @@ def test_a_plant_that_sends_but_stands_still_is_stale(program):
         records.append(tick_record(tick * TICK_NS))
     run = run_drive(program, records)
     assert (run.status, run.final["seq_errors"]) == (0, 0)
-    for estimate, _, _, timing_a, _ in per_job(run):
+    for estimate, *_, timing_a, _ in per_job(run):
         n = timing_a.values["release_index"]
         if n > 20:
             assert timing_a.values["stale_input"] == (61 <= n <= 80), n  # 80 works off the intervals without a frame

@@ -19,6 +19,9 @@ CONTRACT = {
     "Reference": (0x1B0, "PLANT", 100, {
         "speed_demand_mps": (16, *U16, 0.001, 0, True), "slope_rad": (32, *S16, 0.0001, 0, True),
         "tick": (48, *U16, 1, 0, False)}),
+    "Coolant": (0x1C0, "PLANT", 1000, {
+        "soaked": (12, 1, False, 1, 0, False), "coolant_degc": (16, *U16, 1 / 64, -100, True),
+        "ambient_degc": (32, *U16, 1 / 64, -100, True), "tick": (48, *U16, 1, 0, False)}),
     "Estimate": (0x2A0, "ESTIMATOR", 100, {
         "status": (12, 4, False, 1, 0, True), "theta_w_est_degc": (16, *U16, 1 / 256, -50, True),
         "theta_r_est_degc": (32, *U16, 1 / 256, -50, True), "tick": (48, *U16, 1, 0, False)}),
@@ -30,6 +33,11 @@ CONTRACT = {
         "outside_theta_w": (14, 1, False, 1, 0, False), "outside_theta_r": (15, 1, False, 1, 0, False),
         "outside_joint": (16, 1, False, 1, 0, False), "scope": (17, 2, False, 1, 0, False),
         "novelty": (32, *U16, 0.001, 0, True), "tick": (48, *U16, 1, 0, False)}),
+    **{name: (can_id, "ESTIMATOR", 100, {
+        f"sensor_{c}_fault": (12, 3, False, 1, 0, False), f"sensor_{c}_trusted": (15, 1, False, 1, 0, False),
+        f"sigma_{c}_degc": (16, *U16, 0.001, 0, True), f"upper_{c}_degc": (32, *U16, 1 / 256, -50, True),
+        "tick": (48, *U16, 1, 0, False)})
+       for name, can_id, c in (("EstWinding", 0x2A3, "w"), ("EstRotor", 0x2A4, "r"))},
     "EstTimingA": (0x2A8, "ESTIMATOR", 100, {
         "miss_late": (12, 1, False, 1, 0, False), "warmup": (13, 1, False, 1, 0, False),
         "stale_input": (14, 1, False, 1, 0, False), "after_skip": (15, 1, False, 1, 0, False),
@@ -53,12 +61,18 @@ CONTRACT = {
         "repeated_ticks": (12, 4, False, 1, 0, False),
         "off_grid": (16, *U16, 1, 0, False), "invalid_inputs": (32, *U16, 1, 0, False),
         "unconverged": (48, *U16, 1, 0, False)}),
+    "EstCalibration": (0x4A6, "ESTIMATOR", 1000, {
+        "calibration_state": (12, 4, False, 1, 0, False), "offset_w_degc": (16, *S16, 1 / 256, 0, True),
+        "offset_r_degc": (32, *S16, 1 / 256, 0, True), "offset_sigma_w_degc": (48, 8, False, 0.005, 0, True),
+        "offset_sigma_r_degc": (56, 8, False, 0.005, 0, True)}),
     "TruthTemp": (0x6A0, "PLANT", 100, {
         "theta_w_true_degc": (12, 18, False, 1 / 512, -100, True),
         "theta_r_true_degc": (30, 18, False, 1 / 512, -100, True), "tick": (48, *U16, 1, 0, False)}),
     "TruthVehicle": (0x6A1, "PLANT", 100, {
         "v_true_mps": (12, 16, False, 0.001, 0, True), "distance_m": (28, 20, False, 0.1, 0, True),
         "tick": (48, *U16, 1, 0, False)}),
+    "TruthFault": (0x6A2, "PLANT", 100, {
+        "fault_w": (16, *U16, 1, 0, False), "fault_r": (32, *U16, 1, 0, False), "tick": (48, *U16, 1, 0, False)}),
     "PlantStatus": (0x6B0, "PLANT", 1000, {
         "ticks_late": (16, *U16, 1, 0, False), "late_max_ms": (32, *U16, 0.1, 0, True),
         "tx_retries": (48, *U16, 1, 0, False)}),
@@ -85,17 +99,26 @@ def test_the_file_is_the_agreed_contract():
     }  # fmt: skip
     assert found == CONTRACT
     assert all(m.length == 8 and not m.codec.is_extended_frame for m in dbc)
-    assert {m.name for m in dbc if m.simulation_only} == {"TruthTemp", "TruthVehicle"}
-    per_job = {"Estimate", "EstimateInnov", "EstValidity", "EstTimingA", "EstTimingB"}
+    assert {m.name for m in dbc if m.simulation_only} == {"TruthTemp", "TruthVehicle", "TruthFault"}
+    per_job = {"Estimate", "EstimateInnov", "EstValidity", "EstWinding", "EstRotor", "EstTimingA", "EstTimingB"}
     assert {m.name for m in dbc if m.per_job} == per_job
+    assert dbc["EstBuild"].signals[-1].raw_max == 254, "any setting has a number"
 
 
 def test_cantools_loads_it_strictly_and_shows_labels():
     db = cantools.database.load_file(DEFAULT_DBC, strict=True)
-    status = db.get_message_by_name("Estimate").get_signal_by_name("status")
-    assert {int(k): str(v) for k, v in status.choices.items()} == {
-        0: "init", 1: "starting", 2: "ok", 3: "predicting", 4: "input_stale", 5: "invalid", 15: "not_available",
+
+    def labels(message: str, signal: str) -> dict[int, str]:
+        return {int(k): str(v) for k, v in db.get_message_by_name(message).get_signal_by_name(signal).choices.items()}
+
+    assert labels("Estimate", "status") == {
+        0: "init", 1: "starting", 2: "ok", 3: "predicting", 4: "input_stale", 5: "invalid", 6: "open_loop",
+        7: "fallback", 15: "not_available",
     }  # fmt: skip
+    classes = dict(enumerate(("ok", "offset", "noise", "stuck", "dropout", "spike", "drift", "slow")))
+    assert labels("EstWinding", "sensor_w_fault") == labels("EstRotor", "sensor_r_fault") == classes
+    states = dict(enumerate(("datasheet", "measuring", "frozen", "refused")))
+    assert labels("EstCalibration", "calibration_state") == states
 
 
 def test_not_available_is_all_ones_or_most_negative_and_never_a_valid_code():
