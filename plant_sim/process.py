@@ -8,16 +8,18 @@ import json
 import select
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import BinaryIO
 
 import can
 
+from plant_sim.faults import parse_fault
+from plant_sim.mismatch import Mismatch
 from plant_sim.params import load_params
 from plant_sim.plant import CycleSpec, Plant
 from plant_sim.publisher import Publisher
 from rt_runner.bus import open_bus
-from rt_runner.config import Scenario, load_scenario, with_duration
+from rt_runner.config import Scenario, load_scenario, with_duration, with_faults
 from rt_runner.dbc import load_dbc
 from rt_runner.errors import SetupError
 from rt_runner.records import END, TICK, control, pack, read_until_control
@@ -27,16 +29,26 @@ TX_PATIENCE = 100  # tries of 0.1 s each
 TICKS_PER_INTERVAL = 10  # lock-step advances by 0.1 s
 
 
+def _scenario(args) -> Scenario:
+    return with_faults(with_duration(load_scenario(args.scenario), args.duration), args.fault)
+
+
 def make_plant(scenario: Scenario, seed: int) -> Plant:
     """The scenario's plant, advanced off line to the second it starts at."""
     cycle, sensor = scenario.cycle, scenario.sensor
     path = str(scenario.path.parent / cycle.path) if cycle.path else None
-    params = load_params()
+    params = Mismatch(**asdict(scenario.plant)).apply(load_params())
     params = replace(
         params,
         sensor=replace(params.sensor, mean_k=sensor.offset_degc, variance_k2=sensor.variance, delay_s=sensor.delay_s),
     )
-    plant = Plant(params, CycleSpec(kind=cycle.kind, path=path, theta0_degc=cycle.theta0_degc), seed=seed)
+    plant = Plant(
+        params,
+        CycleSpec(kind=cycle.kind, path=path, theta0_degc=cycle.theta0_degc),
+        seed=seed,
+        faults=[parse_fault(text) for text in scenario.all_faults],
+        key_on_s=cycle.key_on_s,
+    )
     plant.advance(cycle.start_s)
     return plant
 
@@ -51,7 +63,7 @@ def run_realtime(args) -> int:
 
     A late tick is sent late and counted: physics is never skipped. Returns the exit status.
     """
-    scenario = with_duration(load_scenario(args.scenario), args.duration)
+    scenario = _scenario(args)
     plant = make_plant(scenario, args.seed)
     publisher = _publisher(scenario, plant)
     copy.deepcopy(plant).step()  # compiles, and loads what the first step would load
@@ -113,7 +125,7 @@ def run_lockstep(args, inp: BinaryIO, out: BinaryIO) -> int:
 
     Time on the records starts at 0 with the first tick simulated here. Writes END after the last frame.
     """
-    scenario = with_duration(load_scenario(args.scenario), args.duration)
+    scenario = _scenario(args)
     plant = make_plant(scenario, args.seed)
     publisher = _publisher(scenario, plant)
     ticks, first = round(scenario.duration_s * 100), plant.tick

@@ -47,17 +47,20 @@ class Publisher:
                 self._encode("TruthVehicle", {"v_true_mps": s.v_mps, "distance_m": s.x_m, "tick": tick}),
                 self._encode("TruthFault", {"fault_w": s.fault_w, "fault_r": s.fault_r, "tick": tick}),
             ]
-        if (s.tick - self._first_tick) % 100 == 0:
-            out += [
+        if s.tick % 100 == 0:
+            out.append(
                 self._encode(
                     "Coolant",
                     {"soaked": s.soaked, "coolant_degc": s.coolant_degc, "ambient_degc": s.ambient_degc, "tick": tick},
-                ),
+                )
+            )
+        if (s.tick - self._first_tick) % 100 == 0:
+            out.append(
                 self._encode(
                     "PlantStatus",
                     {"ticks_late": self.ticks_late, "late_max_ms": self.late_max_ms, "tx_retries": self.tx_retries},
-                ),
-            ]
+                )
+            )
         if first or (s.tick - self._first_tick) % 1000 == 0:
             out.append(self._encode("PlantIdentity", self._identity))
         return out

@@ -2,6 +2,9 @@
 
 import hashlib
 import math
+import os
+import subprocess
+import sys
 import tomllib
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -11,17 +14,30 @@ from rt_runner.result import Limits
 
 TICK_S = 0.01  # the plant's step
 START_MAX_S = 10_800.0
+KEY_ON_MAX_S = 600.0
 SCENARIO_DIR = Path(__file__).parent / "scenarios"
 
 
 @dataclass(frozen=True)
 class CycleConfig:
-    """What is driven, and from where on."""
+    """What is driven, and from where on; ``key_on_s`` of standstill come before it and count in the plant's time."""
 
     kind: str = "lap"
     path: str | None = None
     start_s: float = 0.0
     theta0_degc: float = 60.0
+    key_on_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class PlantConfig:
+    """How the plant differs from the nominal one; scales and shares are factors."""
+
+    coolant_flow_share: float = 1.0
+    coolant_degc: float | None = None
+    ac_loss_scale: float = 1.0
+    resistance_scale: float = 1.0
+    liner_contact_scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -43,7 +59,11 @@ class EstimatorConfig:
 
 @dataclass(frozen=True)
 class Scenario:
-    """One scenario, checked. ``name`` is what the user typed, ``path`` the file it came from."""
+    """One scenario, checked. ``name`` is what the user typed, ``path`` the file it came from.
+
+    ``faults`` are the file's sensor faults, ``added_faults`` those of the command line, as text: what they mean is the
+    plant's business, see `check_faults`.
+    """
 
     name: str
     path: Path
@@ -54,6 +74,14 @@ class Scenario:
     sensor: SensorConfig = field(default_factory=SensorConfig)
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
     limits: Limits = field(default_factory=Limits)
+    plant: PlantConfig = field(default_factory=PlantConfig)
+    faults: tuple[str, ...] = ()
+    added_faults: tuple[str, ...] = ()
+
+    @property
+    def all_faults(self) -> tuple[str, ...]:
+        """The file's sensor faults, then those of the command line."""
+        return self.faults + self.added_faults
 
 
 def scenario_names() -> list[str]:
@@ -90,7 +118,13 @@ def load_scenario(name_or_path: str) -> Scenario:
 
 
 def _build(tree: dict, name: str, path: Path, raw: bytes) -> Scenario:
-    tables = {"cycle": CycleConfig, "sensor": SensorConfig, "estimator": EstimatorConfig, "limits": Limits}
+    tables = {
+        "cycle": CycleConfig,
+        "plant": PlantConfig,
+        "sensor": SensorConfig,
+        "estimator": EstimatorConfig,
+        "limits": Limits,
+    }
     values: dict = {"name": name, "path": path, "sha256": hashlib.sha256(raw).hexdigest()}
     for key, value in tree.items():
         if key in tables:
@@ -99,8 +133,13 @@ def _build(tree: dict, name: str, path: Path, raw: bytes) -> Scenario:
             values[key] = _table(tables[key], value, f"scenario {path}, [{key}]")
         elif key in ("title", "duration_s"):
             values[key] = _typed(value, str if key == "title" else float, f"scenario {path}: {key}")
+        elif key == "faults":
+            if not (isinstance(value, list) and all(isinstance(fault, str) for fault in value)):
+                raise UsageError(f"scenario {path}: faults must be a list of texts such as 'offset:-20@430-550'")
+            values[key] = tuple(value)
         else:
-            raise UsageError(f"scenario {path}: unknown key '{key}' (known: title, duration_s, {', '.join(tables)})")
+            known = ", ".join(("title", "duration_s", "faults", *tables))
+            raise UsageError(f"scenario {path}: unknown key '{key}' (known: {known})")
     return Scenario(**values)
 
 
@@ -136,6 +175,15 @@ def _check(s: Scenario) -> None:
         refuse(f"duration_s must be 0 (to the end of the cycle), or {TICK_S:g} s or more")
     if not 0 <= s.cycle.start_s <= START_MAX_S:
         refuse(f"[cycle] start_s must lie in 0 … {START_MAX_S:g}: the plant is driven up to there before the start")
+    if not 0 <= s.cycle.key_on_s <= KEY_ON_MAX_S or abs(s.cycle.key_on_s * 100 - round(s.cycle.key_on_s * 100)) > 1e-6:
+        refuse(f"[cycle] key_on_s must lie in 0 … {KEY_ON_MAX_S:g} in steps of {TICK_S:g} s")
+    if s.cycle.key_on_s and s.cycle.start_s:
+        refuse("[cycle] key_on_s is the run's beginning: it needs start_s = 0")
+    p = s.plant
+    if not all(0 < x <= 10 for x in (p.coolant_flow_share, p.ac_loss_scale, p.resistance_scale, p.liner_contact_scale)):
+        refuse("[plant] shares and scales must be above 0 and at most 10")
+    if p.coolant_degc is not None and not -40 <= p.coolant_degc <= 120:
+        refuse("[plant] coolant_degc must lie in -40 … 120")
     if not -40 <= s.cycle.theta0_degc <= 200:
         refuse("[cycle] theta0_degc must lie in -40 … 200")
     if not (0 <= s.sensor.variance < math.inf and 0 <= s.sensor.delay_s <= 10 and abs(s.sensor.offset_degc) <= 100):
@@ -161,3 +209,27 @@ def with_duration(s: Scenario, duration_s: float | None) -> Scenario:
     if not TICK_S <= duration_s < math.inf:
         raise UsageError(f"--duration {duration_s:g}: must be {TICK_S:g} s or more")
     return replace(s, duration_s=duration_s)
+
+
+def with_faults(s: Scenario, faults: list[str] | None) -> Scenario:
+    """The scenario with sensor faults added, where some are given."""
+    return replace(s, added_faults=s.added_faults + tuple(faults)) if faults else s
+
+
+def check_faults(s: Scenario) -> None:
+    """Have the plant's package read the scenario's sensor faults: what cannot be is refused before anything starts.
+
+    Raises
+    ------
+    UsageError
+        A fault is not understood, impossible, in conflict with another one, or outside the run.
+    """
+    if not s.all_faults:
+        return
+    end_s = s.cycle.start_s + s.duration_s if s.duration_s else math.inf
+    command = [sys.executable, "-m", "plant_sim.faults", str(s.cycle.start_s), str(end_s), *s.all_faults]
+    environment = {**os.environ, "PYTHONSAFEPATH": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    if done.returncode != 0:
+        lines = done.stderr.strip().splitlines()
+        raise UsageError(lines[-1] if lines else f"plant_sim.faults ended with exit status {done.returncode}")

@@ -89,6 +89,7 @@ def run_lockstep(
     plant_command += ["--seed", str(seed)]
     if scenario.duration_s:
         plant_command += ["--duration", str(scenario.duration_s)]
+    plant_command += [f"--fault={fault}" for fault in scenario.added_faults]
     estimator_command = [str(paths.binary("rt_estimator")), "--lockstep", "--no-rt", "--setting", e.setting]
     estimator_command += ["--period-us", str(round(e.period_s * 1e6))]
     facts = RunFacts(
@@ -98,6 +99,7 @@ def run_lockstep(
         lockstep=True,
         seed=seed,
         limits=scenario.limits,
+        faults=scenario.all_faults,
     )
     accumulator = ResultAccumulator()
     peers: list[_Peer] = []

@@ -13,6 +13,11 @@ def build_dir() -> Path:
     return Path(os.environ.get("RT_BUILD_DIR") or ROOT / "build")
 
 
+def setting_names() -> list[str]:
+    """Names of the estimator's settings, as the build compiles them in."""
+    return sorted(p.stem for p in (ROOT / "estimator_c" / "settings").glob("*.toml"))
+
+
 def binary(name: str) -> Path:
     """Path of a built program.
 

@@ -69,6 +69,7 @@ def gather(scenario: Scenario, bus: str, seed: int, identity: dict) -> Provenanc
         "duration_s": repr(scenario.duration_s),
         "setting": scenario.estimator.setting,
         "period_s": repr(scenario.estimator.period_s),
+        "faults": ", ".join(scenario.all_faults),
         "scenario_sha256": scenario.sha256,
         **{name: str(identity.get(name, "")) for name in HASHES},
         **machine.describe(),

@@ -16,7 +16,7 @@ RELEASE_BITS = 24
 RELEASES_LAST, SKIPPED_LAST = (1 << 24) - 2, (1 << 16) - 2  # counters stop at their last valid code
 SETTLE_S = 10.0  # accuracy is judged from here after the first estimate: the net's memory starts empty
 REPEATED, WRONG_CRC = 1, 4  # E2E states as in the log
-STATUS_SHOWN = ("init", "starting", "ok", "predicting", "input_stale", "invalid")
+STATUS_SHOWN = ("init", "starting", "ok", "predicting", "input_stale", "invalid", "open_loop", "fallback")
 CAUSES = ("none", "late_wake", "preempted", "long_compute", "stale_input", "blocked_send")
 MACHINE_CAUSES = ("late_wake", "preempted")
 CORE_FAULTS = {
@@ -51,6 +51,7 @@ class RunFacts:
     steal_ms: float | None = None
     log_dropped: int = 0  # frames the kernel or the hub dropped before the logger saw them
     log_cut_short: bool = False  # the logger could not take all that had arrived
+    faults: tuple[str, ...] = ()  # of the sensors, as text
 
     @staticmethod
     def from_dict(values: dict) -> "RunFacts":
@@ -60,6 +61,7 @@ class RunFacts:
         if isinstance(kept.get("limits"), dict):
             names = {f.name for f in fields(Limits)}
             kept["limits"] = Limits(**{k: v for k, v in kept["limits"].items() if k in names})
+        kept["faults"] = tuple(kept.get("faults") or ())
         return RunFacts(**kept)
 
 
@@ -274,6 +276,7 @@ class ResultAccumulator:
             "bus": facts.bus,
             "scenario": facts.scenario,
             "seed": facts.seed,
+            "faults": list(facts.faults),
             "duration_s": round(facts.duration_s if facts.duration_s is not None else span_s, 3),
             "accuracy": accuracy,
             "timing": {

@@ -103,6 +103,7 @@ class Supervisor:
             period_s=scenario.estimator.period_s,
             seed=plan.seed,
             limits=scenario.limits,
+            faults=scenario.all_faults,
         )
 
     def _plant_command(self, bus: str) -> list[str]:
@@ -110,6 +111,7 @@ class Supervisor:
         command = ["plant_sim", "--scenario", str(scenario.path), "--bus", bus, "--seed", str(plan.seed)]
         if scenario.duration_s:
             command += ["--duration", str(scenario.duration_s)]
+        command += [f"--fault={fault}" for fault in scenario.added_faults]
         return [sys.executable, "-m", *command]
 
     def _run_on(self, bus: str, logger: Child) -> dict:

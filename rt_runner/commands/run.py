@@ -21,12 +21,21 @@ def add_parser(verbs) -> None:
 
 def add_scenario_options(p: argparse.ArgumentParser, default: str) -> None:
     """Options that ``run`` and ``mil`` share."""
+    from rt_runner.paths import setting_names
+
     p.add_argument(
         "scenario", nargs="?", default=default, metavar="SCENARIO", help=f"name or .toml file (default: {default})"
     )
     p.add_argument("--duration", type=float, metavar="S", help="seconds, instead of the scenario's")
-    p.add_argument("--setting", help="estimator setting: default or paper")
+    p.add_argument("--setting", metavar="NAME", help=f"estimator setting: {', '.join(setting_names())}")
     p.add_argument("--period", type=float, metavar="S", help="period of the estimator's loop, 0.001 … 1")
+    p.add_argument(
+        "--fault",
+        action="append",
+        metavar="SPEC",
+        help="a sensor fault beside the scenario's, KIND[:AMPLITUDE]@START-END[/CHANNEL] in seconds of the plant, "
+        "e.g. offset:-20@430-550 or stuck@430-490/r; may be given again",
+    )
     p.add_argument(
         "--log", metavar="FILE.mcap", help="default: logs/SCENARIO-TIME.mcap; an existing file is kept, renamed"
     )
@@ -38,10 +47,11 @@ def scenario_from(args):
     """The scenario that the options describe, checked."""
     from dataclasses import replace
 
-    from rt_runner.config import check_period, load_scenario, with_duration
+    from rt_runner.config import check_faults, check_period, load_scenario, with_duration, with_faults
     from rt_runner.errors import UsageError
 
-    s = with_duration(load_scenario(args.scenario), args.duration)
+    s = with_faults(with_duration(load_scenario(args.scenario), args.duration), args.fault)
+    check_faults(s)
     if args.seed < 0:
         raise UsageError(f"--seed {args.seed}: must be 0 or more")
     if args.period is not None:

@@ -4,7 +4,16 @@ import dataclasses
 
 import pytest
 
-from rt_runner.config import check_period, load_scenario, scenario_names, with_duration
+from plant_sim.mismatch import Mismatch
+from rt_runner.config import (
+    PlantConfig,
+    check_faults,
+    check_period,
+    load_scenario,
+    scenario_names,
+    with_duration,
+    with_faults,
+)
 from rt_runner.errors import UsageError
 
 
@@ -14,6 +23,7 @@ def test_shipped_scenarios_load(name):
     assert s.name == name
     assert s.title
     assert len(s.sha256) == 64
+    check_faults(s)
 
 
 def test_the_main_job_is_a_minute_of_the_hot_lap():
@@ -39,6 +49,15 @@ def test_a_file_of_ones_own(tmp_path):
         ("duration_s = nan", "0.01 s or more"),
         ("duration_s = 0.004", "0.01 s or more"),
         ("[cycle]\nstart_s = 1e5", "0 … 10800"),
+        ("[cycle]\nkey_on_s = 1e3", "0 … 600"),
+        ("[cycle]\nkey_on_s = 0.005", "steps of 0.01"),
+        ("[cycle]\nkey_on_s = 15\nstart_s = 400", "needs start_s = 0"),
+        ('faults = "offset:-20@430-550"', "list of texts"),
+        ("faults = [20]", "list of texts"),
+        ("[plant]\ncoolant = 50", "unknown key 'coolant'"),
+        ("[plant]\ncoolant_flow_share = 0", "above 0"),
+        ("[plant]\nresistance_scale = nan", "above 0"),
+        ("[plant]\ncoolant_degc = 150", "-40 … 120"),
         ('[cycle]\nkind = "csv"\npath = "gone.csv"', "no file"),
         ("cycle = 5", "must be a table"),
         ('[cycle]\nkind = "moon"', "none of lap, class3, csv"),
@@ -87,3 +106,35 @@ def test_periods():
     for bad in (0.0, 0.0009, 1.1, float("nan")):
         with pytest.raises(UsageError):
             check_period(bad, "x")
+
+
+def test_a_plant_can_differ_in_what_the_plant_knows():
+    """The runner knows no physics, so the two tables are written twice; they must not drift apart."""
+    assert dataclasses.asdict(PlantConfig()) == dataclasses.asdict(Mismatch())
+
+
+def test_faults_of_the_command_line_come_on_top():
+    s = load_scenario("lap-offset")
+    assert s.all_faults == s.faults == ("offset:-20@430-550",)
+    more = with_faults(s, ["stuck@1-2/r"])
+    assert (more.faults, more.all_faults) == (s.faults, ("offset:-20@430-550", "stuck@1-2/r"))
+    assert with_faults(s, None) is s
+    check_faults(more)
+
+
+@pytest.mark.parametrize(
+    ("name", "fault", "says"),
+    [
+        ("hot-lap", "wobble:1@410-420", "fault 'wobble:1@410-420': kind 'wobble' does not exist"),
+        ("hot-lap", "offset:5@0-400", "lies outside the run, which goes from 400 s to 460 s"),
+        ("hot-lap", "offset:5@460-500", "lies outside the run"),
+        ("lap-offset", "offset:5@500-600", "overlap"),
+        ("hot-lap", "--help", "not understood"),
+    ],
+)
+def test_faults_that_cannot_be_are_refused_before_anything_starts(name, fault, says):
+    with pytest.raises(UsageError) as e:
+        check_faults(with_faults(load_scenario(name), [fault]))
+    assert says in str(e.value)
+    assert "\n" not in str(e.value)
+    check_faults(with_faults(load_scenario("hot-lap"), ["offset:5@0-400.01", "noise:5@459.99-500"]))
