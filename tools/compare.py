@@ -3,9 +3,9 @@
     rt-runner compare [--seeds 3] [--estimators default,ekf] [--cases nominal,offset] [--channel winding|rotor]
                       [--json FILE] [--doc FILE.md] [--figures DIR]
 
-The plant drives the lap once (and once per plant mismatch); each seed's sensor noise, with and without faults, is put on
-top, quantised as the bus does, and run through the C core and the baselines. No clock, no bus, no frames: a test shows
-that the estimates are those of `rt-runner mil`, to the last bit.
+The plant drives the lap once (and once per plant mismatch); each seed's sensor noise, with and without faults, is put
+on top, quantised as the bus does, and run through the C core and the baselines. No clock, no bus, no frames: a test
+shows that the estimates are those of `rt-runner mil`, to the last bit.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"compare: {error}", file=sys.stderr)
         return 1
     except BrokenProcessPool:
-        print("compare: a worker process was killed; is there memory enough? --workers 1 needs the least", file=sys.stderr)
+        print("compare: a worker process was killed; --workers 1 needs the least memory", file=sys.stderr)
         return 1
     except OSError as error:
         print(f"compare: {error.filename}: {error.strerror}; choose another file", file=sys.stderr)

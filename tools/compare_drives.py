@@ -51,7 +51,7 @@ class Lap:
     @property
     def t_s(self) -> Array:
         """Time at the end of each row, (n,)."""
-        return 0.1 * np.arange(1, len(self.truth_degc) + 1)
+        return 0.1 * np.arange(1, len(self.truth_degc) + 1, dtype=np.float64)
 
 
 @cache

@@ -79,7 +79,7 @@ def judge(found: Estimates, truth_degc: Array, channel: int, window_s: tuple[flo
 
     An estimate that is missing or not finite in the judged time counts as an infinite error: silence is no accuracy.
     """
-    t_s = DT_S * np.arange(1, len(truth_degc) + 1)
+    t_s = DT_S * np.arange(1, len(truth_degc) + 1, dtype=np.float64)
     judged = t_s >= JUDGED_FROM_S - SLACK_S
     error = np.abs(found.theta_degc[:, channel] - truth_degc[:, channel])
     error = np.where(np.isfinite(error), error, math.inf)
@@ -147,9 +147,11 @@ def _recovery_s(error: Array, t_s: Array, end_s: float) -> float | None:
 
 
 def pooled(runs: Sequence[Sequence[Figures]]) -> dict[str, Any]:
-    """One case out of its runs [seed][variant]: RMSE over a seed's variants together, largest error over them; then mean
-    and standard deviation over the seeds. Times are means over the runs that have one; `missed` and `unrecovered` are
-    the shares of faulty runs that have none. What cannot be said is None.
+    """One case out of its runs [seed][variant].
+
+    RMSE over a seed's variants together, largest error over them; then mean and standard deviation over the seeds.
+    Times are means over the runs that have one; `missed` and `unrecovered` are the shares of faulty runs that have
+    none. What cannot be said is None.
     """
     flat = [f for seed in runs for f in seed]
     faulty = [f for f in flat if f.faulty]

@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -51,8 +51,6 @@ def compare(
     for plant in plants:
         if plant not in _laps:
             _laps[plant] = drive_lap(plant)
-    for name in estimators:  # names are checked and loops compiled once, before the fork
-        run(make(name), sense(_laps[plants[0]], 0).cut(0, 40))
     tasks = [Task(name, seed, channel, group) for seed in range(seeds) for name in estimators for group in groups]
     tasks.sort(key=lambda t: len(t.variants), reverse=True)  # short ones last: they fill the gaps
 
@@ -75,9 +73,21 @@ def _work(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, list[Figu
         yield from ((task, perform(task)) for task in tasks)
         return
     with _pool(min(workers, len(tasks))) as pool:
-        futures: dict[Future[list[Figures]], Task] = {pool.submit(perform, task): task for task in tasks}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
+        # Whoever warms an estimator up compiles its loops, once in a checkout; the others then find them on disk.
+        names = dict.fromkeys(task.estimator for task in tasks)
+        under_way: dict[Future[list[Figures]], Task | str] = {pool.submit(_warm_up, name): name for name in names}
+        while under_way:
+            for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+                what, figures = under_way.pop(future), future.result()
+                if isinstance(what, Task):
+                    yield what, figures
+                else:
+                    under_way |= {pool.submit(perform, task): task for task in tasks if task.estimator == what}
+
+
+def _warm_up(name: str) -> list[Figures]:
+    run(make(name), sense(next(iter(_laps.values())), 0).cut(0, 40))
+    return []
 
 
 @contextmanager

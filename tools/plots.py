@@ -59,7 +59,7 @@ def plot_dataset(path: Path, rows: Rows, title: str) -> None:
     hot = (rows.x[:, 2] >= 150.0) & (rows.x[:, 2] <= 160.0)
     axes[1, 0].axvspan(150.0, 160.0, color=PREDICTED, alpha=0.2, lw=0)
     axes[1, 0].set_title(f"150..160 °C: {hot.mean():.1%} of {len(hot)} rows", fontsize=9)
-    _save(figure, path)
+    save(figure, path)
 
 
 def plot_evaluation(path: Path, t_s: Array, rows: Rows, rates: Array, theta: Array, title: str) -> None:
@@ -87,7 +87,7 @@ def plot_evaluation(path: Path, t_s: Array, rows: Rows, rates: Array, theta: Arr
         ax = axes[2, i]
         _over_time(ax, t_s, rows.x[:, 2 + i], theta[:, i], f"{THETA_NAMES[i]}, open loop")
         ax.set_xlabel("time, s")
-    _save(figure, path)
+    save(figure, path)
 
 
 def _over_time(ax: Axes, t_s: Array, actual: Array, predicted: Array, name: str) -> None:
@@ -122,7 +122,7 @@ def _figure(n_rows: int, n_columns: int, size: tuple[float, float], title: str) 
     return figure, axes
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path) -> None:
     import matplotlib
 
     kind = path.suffix.lower().lstrip(".")

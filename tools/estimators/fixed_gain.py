@@ -8,10 +8,10 @@ from training-type drives (`tune.py`), never from the lap.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from tools.estimators.drive import DELAY_STEPS, OFFSET_DEGC, Drive, Estimates
+from tools.estimators.jit import compiled
 from tools.estimators.net import Net, memory_size, scratch_size, step
 from tools.estimators.session import ArraySession
 from tools.estimators.start import EARLY, SPIN_UP_STEPS, begins
@@ -45,7 +45,7 @@ class FixedGain:
         _observe(self._net, self._gain, self._gate, memory, drive.u, drive.y, first, last, scratch, out)
 
 
-@njit(cache=True)
+@compiled
 def _observe(net, gain, gate, memory, u, y, first, last, scratch, out):
     early, state = memory[:EARLY], memory[EARLY:]
     ahead = np.empty_like(state)

@@ -17,8 +17,9 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tools.estimators.jit import compiled
 
 Array = NDArray[np.float64]
 NODES = 4  # winding, teeth, yoke, rotor
@@ -85,7 +86,7 @@ def heats(u: Array) -> Array:
     return low * (1.0 - a) + high * a
 
 
-@njit(cache=True)
+@compiled
 def step(p, speed_rpm, heat, theta, slope):
     """One explicit Euler step of theta (4,) in place; slope (4, 4) becomes the Jacobian of the step."""
     x = abs(speed_rpm) / 1.0e4

@@ -8,11 +8,11 @@ Teeth and yoke start at the mean of winding and coolant, uncertain by 20 K.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from tools.estimators import lptn
 from tools.estimators.drive import DELAY_STEPS, OFFSET_DEGC, Drive, Estimates
+from tools.estimators.jit import compiled
 from tools.estimators.lptn import COOLANT_DEGC, NODES, ROTOR, Lptn
 from tools.estimators.session import ArraySession
 from tools.estimators.start import EARLY, PRIOR_VARIANCE_K2, begins
@@ -55,10 +55,10 @@ class LptnKf:
         _filter(self._network, self._q, self._r, self._gate, memory, drive.u, heat, drive.y, first, last, out)
 
 
-@njit(cache=True)
+@compiled
 def _filter(network, q, r, gate, memory, u, heat, y, first, last, out):
     early, theta, cov = memory[:EARLY], memory[EARLY : EARLY + NODES], memory[EARLY + NODES :].reshape(NODES, NODES)
-    slope, ahead = np.empty((NODES, NODES)), np.empty(NODES)
+    slope, work, ahead = np.empty((NODES, NODES)), np.empty((NODES, NODES)), np.empty(NODES)
     for row in range(first, last):
         node = row - DELAY_STEPS
         if early[4] == 0.0:
@@ -70,9 +70,7 @@ def _filter(network, q, r, gate, memory, u, heat, y, first, last, out):
             cov[1, 1] = cov[2, 2] = IRON_START_VARIANCE_K2
         else:
             lptn.step(network, u[node, 0], heat[node], theta, slope)
-            cov[:] = slope @ cov @ slope.T
-            for i in range(NODES):
-                cov[i, i] += q[i]
+            _spread(slope, q, cov, work)
         for ch in range(2):
             at = 0 if ch == 0 else ROTOR
             innovation = y[row, ch] - OFFSET_DEGC - theta[at]
@@ -83,3 +81,20 @@ def _filter(network, q, r, gate, memory, u, heat, y, first, last, out):
         for k in range(node + 1, row + 1):
             lptn.step(network, u[k, 0], heat[k], ahead, slope)
         out[row - first, 0], out[row - first, 1] = ahead[0], ahead[ROTOR]
+
+
+@compiled
+def _spread(slope, q, cov, work):
+    """cov becomes slope cov slope' + diag(q)."""
+    for i in range(NODES):
+        for j in range(NODES):
+            total = 0.0
+            for k in range(NODES):
+                total += slope[i, k] * cov[k, j]
+            work[i, j] = total
+    for i in range(NODES):
+        for j in range(NODES):
+            total = q[i] if i == j else 0.0
+            for k in range(NODES):
+                total += work[i, k] * slope[j, k]
+            cov[i, j] = total

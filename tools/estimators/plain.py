@@ -6,10 +6,10 @@ Where the bus says "not available" the last value is held, as a plain user would
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from tools.estimators.drive import Drive, Estimates
+from tools.estimators.jit import compiled
 from tools.estimators.session import ArraySession
 
 Array = NDArray[np.float64]
@@ -32,7 +32,7 @@ class MovingAverage:
         _average(memory, drive.y, first, last, self._rows, out)
 
 
-@njit(cache=True)
+@compiled
 def _average(memory, y, first, last, count, out):
     held, ring = memory[:2], memory[2:].reshape(count, 2)
     for row in range(first, last):

@@ -7,16 +7,16 @@ the first node a measurement speaks for after both channels have given one.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from tools.estimators.drive import DELAY_STEPS, OFFSET_DEGC
+from tools.estimators.jit import compiled
 
 SPIN_UP_STEPS = 5  # fill the net's empty memory with the first input
 PRIOR_VARIANCE_K2 = 10.0  # of the start temperatures
 EARLY = 5  # numbers kept: sum w, sum r, count w, count r, started
 
 
-@njit(cache=True)
+@compiled
 def begins(early, y, row):
     """Take a row's measurement before the start; True when the estimator starts at this row (which then uses it)."""
     if row >= DELAY_STEPS and early[2] > 0.0 and early[3] > 0.0:

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from plant_sim.params import load_params
 from tools.estimators import lptn
 from tools.estimators.drive import DELAY_STEPS, OFFSET_DEGC, VARIANCE_K2, Drive, Estimator, run
+from tools.estimators.jit import compiled
 from tools.estimators.lptn import NODES, ROTOR, Lptn
 from tools.estimators.tuned import FILE, Tuned
 from tools.files import write_whole
@@ -64,7 +64,7 @@ def errors(estimator: Estimator, cases: Sequence[Example]) -> Array:
 
 
 # ---- the network: smallest prediction error of an observer that forgets in a minute --------------------------------
-@njit(cache=True)
+@compiled
 def _drift(network, u, heat, truth, share, out):
     theta, slope = np.empty(NODES), np.empty((NODES, NODES))
     theta[0], theta[ROTOR] = truth[0, 0], truth[0, 1]

@@ -9,10 +9,10 @@ central point). The measurement is linear in the state, so the update is the Kal
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from tools.estimators.drive import DELAY_STEPS, OFFSET_DEGC, Drive, Estimates
+from tools.estimators.jit import compiled
 from tools.estimators.net import Net, memory_size, scratch_size, step
 from tools.estimators.session import ArraySession
 from tools.estimators.start import EARLY, PRIOR_VARIANCE_K2, SPIN_UP_STEPS, begins
@@ -49,7 +49,7 @@ class Ukf:
         _filter(self._net, self._q, self._r, self._gate, memory, drive.u, drive.y, first, last, scratch, out)
 
 
-@njit(cache=True)
+@compiled
 def _filter(net, q, r, gate, memory, u, y, first, last, scratch, out):
     early, rest = memory[:EARLY], memory[EARLY:]
     n = 0
@@ -83,12 +83,12 @@ def _filter(net, q, r, gate, memory, u, y, first, last, scratch, out):
             out[row - first, ch] = ahead[ch]
 
 
-@njit(cache=True)
+@compiled
 def _predict(net, q, u, mean, cov, points, root, scratch):
     """Mean and covariance one step on, through the sigma points."""
     n = mean.size
     square_root(cov, root)
-    spread = np.sqrt(float(n))
+    spread, weight = np.sqrt(float(n)), 0.5 / n
     for k in range(n):
         for i in range(n):
             points[k, i] = mean[i] + spread * root[i, k]
@@ -97,14 +97,15 @@ def _predict(net, q, u, mean, cov, points, root, scratch):
     for k in range(2 * n):
         step(net, u, points[k], scratch)
         for i in range(n):
-            mean[i] += points[k, i] / (2 * n)
+            mean[i] += weight * points[k, i]
     cov[:] = 0.0
     for k in range(2 * n):
         for i in range(n):
             points[k, i] -= mean[i]
         for i in range(n):
+            scaled = weight * points[k, i]
             for j in range(i + 1):
-                cov[i, j] += points[k, i] * points[k, j] / (2 * n)
+                cov[i, j] += scaled * points[k, j]
     for ch in range(2):
         cov[ch, ch] += q[ch]
     for i in range(n):
@@ -112,7 +113,7 @@ def _predict(net, q, u, mean, cov, points, root, scratch):
             cov[j, i] = cov[i, j]
 
 
-@njit(cache=True)
+@compiled
 def correct(mean, cov, ch, innovation, variance):
     """Kalman update by one component of the state measured directly; variance: of the innovation."""
     n = mean.size
@@ -123,7 +124,7 @@ def correct(mean, cov, ch, innovation, variance):
             cov[i, j] -= column[i] * column[j] / variance
 
 
-@njit(cache=True)
+@compiled
 def square_root(cov, root):
     """Lower Cholesky factor of a covariance that may be singular: directions without variance give empty columns."""
     n = cov.shape[0]
