@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 from typing import Any, TextIO
 
 from rt_runner.log_summary import LogSummary, MessageSummary
+from rt_runner.present import sensor_lines
 
 COLUMNS = ("id", "message", "frames", "cycle", "mean", "min", "max", "lost", "rep", "seq", "crc", "")
 _LEGEND = "times in ms; lost, rep, seq, crc: frames missing, repeated, out of sequence, damaged"
@@ -97,6 +98,7 @@ def _verdict(result: dict[str, Any] | None) -> list[str]:
         rmse = [figures.get(k) for k in ("est_rmse_degc", "raw_rmse_degc", "est_max_degc")]
         estimate, raw, worst = ("n/a" if v is None else f"{v:.3f} degC" for v in rmse)
         lines.append(f"  {channel}: estimate RMSE {estimate} (sensor {raw}), worst {worst}")
+    lines += [f"  {line}" for line in sensor_lines(result)]
     for finding in result.get("findings", []):
         lines.append(f"  {finding.get('what')}: {finding.get('verdict')}: {finding.get('evidence')}")
     return lines

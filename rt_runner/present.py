@@ -119,6 +119,7 @@ def summary(result: dict, log: Path | None) -> str:
                 f"{title:<10} estimate RMSE {a['est_rmse_degc']:.3f} degC (max {a['est_max_degc']:.3f}), "
                 f"raw sensor {raw} degC"
             )
+    lines += sensor_lines(result)
     t = result["timing"]["estimator"]
     lines.append(
         f"{'jobs':<10} {t['jobs']} at {t['period_s'] * 1e3:g} ms, {t['miss_late']} late, {t['miss_skipped']} skipped"
@@ -144,3 +145,27 @@ def summary(result: dict, log: Path | None) -> str:
         lines.append(f"{f['verdict']:<12} {f['what']}: {f['evidence']}")
     lines.append(f"verdict: {result['verdict']}")
     return "\n".join(lines)
+
+
+def sensor_lines(result: dict) -> list[str]:
+    """What became of the sensors, a line each; none where nothing was said about them (an older log)."""
+    lines = []
+    for channel, title in (("theta_w", "winding"), ("theta_r", "rotor")):
+        s = result.get("sensors", {}).get(channel, {})
+        if not s.get("class_share"):
+            continue
+        parts = [", ".join(f"{name} {share:.1%}" for name, share in s["class_share"].items())]
+        if s["true_faults"]:
+            found = "never noticed" if s["detection_s"] is None else f"noticed after {s['detection_s']:g} s"
+            parts.append(f"truly {', '.join(s['true_faults'])} from {s['fault_start_s']:g} s on, {found}")
+            if s["fault_max_error_degc"] is not None:
+                parts.append(f"error then up to {s['fault_max_error_degc']:.3f} degC")
+        if s["above_upper_jobs"]:
+            parts.append(f"truth ABOVE the upper bound in {s['above_upper_jobs']} jobs")
+        lines.append(f"{'sensor':<10} {title}: {'; '.join(parts)}")
+    calibration = result.get("sensors", {}).get("calibration", {})
+    if lines and calibration.get("state") not in (None, "datasheet"):
+        offsets = (calibration.get(f"offset_{c}_degc") for c in "wr")
+        shown = " / ".join("n/a" if o is None else f"{o:.3f}" for o in offsets)
+        lines.append(f"{'offset':<10} {calibration['state']}: winding / rotor {shown} degC")
+    return lines

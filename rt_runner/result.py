@@ -9,6 +9,7 @@ from bisect import bisect_right
 from dataclasses import dataclass, field, fields, replace
 
 from rt_runner.judge import Finding, judge_misses, overall, percentile
+from rt_runner.sensor_account import SensorAccount
 
 TICK_S = 0.01
 TICK_BITS = 16
@@ -101,7 +102,7 @@ class ResultAccumulator:
     def __init__(self) -> None:
         self._ticks: dict[str, Unwrapper] = {}
         self._truth, self._sensor, self._estimate = _Trace(), _Trace(), _Trace()
-        self._anchor: int | None = None
+        self._sensors = SensorAccount()
         self._first_estimate_tick: int | None = None
         self._release = Unwrapper(RELEASE_BITS)
         self._releases: list[int] = []
@@ -176,6 +177,27 @@ class ResultAccumulator:
             self._first_estimate_tick = tick
         self._estimate.add(tick, v.get("theta_w_est_degc"), v.get("theta_r_est_degc"))
 
+    def _on_EstWinding(self, v: dict) -> None:
+        self._on_channel("theta_w", v)
+
+    def _on_EstRotor(self, v: dict) -> None:
+        self._on_channel("theta_r", v)
+
+    def _on_channel(self, channel: str, v: dict) -> None:
+        if self._last.get("Estimate", {}).get("theta_w_est_degc") is None:
+            return  # nothing is estimated yet, and its tick means nothing
+        tick = self._tick(v)
+        if tick is not None:
+            self._sensors.add_job(channel, tick, v)
+
+    def _on_TruthFault(self, v: dict) -> None:
+        tick = self._tick(v)
+        if tick is not None:
+            self._sensors.add_truth(tick, v)
+
+    def _on_EstCalibration(self, v: dict) -> None:
+        self._sensors.add_calibration(v)
+
     def _true_at(self, tick: int, channel: str) -> float | None:
         """Truth between its two neighbouring samples, linear; None outside what was logged."""
         ticks, theta = self._truth.tick, getattr(self._truth, channel)
@@ -190,28 +212,36 @@ class ResultAccumulator:
             return None
         return theta[a] if span == 0 else theta[a] + (theta[b] - theta[a]) * (tick - ticks[a]) / span
 
-    def _errors(self, trace: _Trace, channel: str, from_tick: int) -> list[float]:
+    def _errors(self, trace: _Trace, channel: str) -> list[tuple[int, float]]:
+        """(tick, error) of what is judged: from `SETTLE_S` after the first estimate on."""
+        if self._first_estimate_tick is None:
+            return []
+        from_tick = self._first_estimate_tick + round(SETTLE_S / TICK_S)
         out = []
         for tick, theta in zip(trace.tick, getattr(trace, channel), strict=True):
             if theta is None or tick < from_tick:
                 continue
             true = self._true_at(tick, channel)
             if true is not None:
-                out.append(theta - true)
+                out.append((tick, theta - true))
         return out
 
     def _accuracy(self, channel: str) -> dict[str, float | int | None]:
-        none = {"raw_rmse_degc": None, "est_rmse_degc": None, "est_max_degc": None, "samples": 0}
-        if self._first_estimate_tick is None:
-            return none
-        start = self._first_estimate_tick + round(SETTLE_S / TICK_S)
-        raw, est = (self._errors(t, channel, start) for t in (self._sensor, self._estimate))
+        raw, est = ([e for _, e in self._errors(t, channel)] for t in (self._sensor, self._estimate))
         return {
             "raw_rmse_degc": _rms(raw),
             "est_rmse_degc": _rms(est),
             "est_max_degc": max(map(abs, est)) if est else None,
             "samples": len(est),
         }
+
+    def _sensor_accounts(self) -> dict:
+        out: dict = {}
+        for channel in ("theta_w", "theta_r"):
+            key = f"{channel}_degc"
+            errors = dict(self._errors(self._estimate, key))
+            out[channel] = self._sensors.channel(channel, lambda tick, key=key: self._true_at(tick, key), errors)
+        return {**out, "calibration": self._sensors.calibration()}
 
     # ---- timing ---------------------------------------------------------------------------------------
     def _on_EstTimingA(self, v: dict) -> None:
@@ -279,6 +309,7 @@ class ResultAccumulator:
             "faults": list(facts.faults),
             "duration_s": round(facts.duration_s if facts.duration_s is not None else span_s, 3),
             "accuracy": accuracy,
+            "sensors": self._sensor_accounts(),
             "timing": {
                 "estimator": {
                     "period_s": facts.period_s,
