@@ -38,6 +38,10 @@ class Lap:
         Winding and rotor at the end of each row.
     theta0_degc : (2,)
         The same at the start.
+    sensor
+        Delay and noise of the sensors.
+    coolant_degc : (n,)
+        As the bus carries it: once a second, NaN elsewhere. The machine never starts soaked here.
     """
 
     torque_nm: Array
@@ -46,7 +50,7 @@ class Lap:
     truth_degc: Array
     theta0_degc: Array
     sensor: SensorParams
-    coolant_degc: float
+    coolant_degc: Array
 
     @property
     def t_s(self) -> Array:
@@ -74,8 +78,14 @@ def drive_lap(mismatch: str | None = None, spec: CycleSpec | None = None) -> Lap
     speed = carried(motor, "speed_rpm", rows[:, ROW_SPEED])
     return Lap(
         torque, speed, interval_means(torque, speed), rows[TICKS - 1 :: TICKS, [ROW_THETA_W, ROW_THETA_R]].copy(),
-        np.full(2, spec.theta0_degc), params.sensor, params.boundary.coolant_degc,
+        np.full(2, spec.theta0_degc), params.sensor, _coolant(params.boundary.coolant_degc, count),
     )  # fmt: skip
+
+
+def _coolant(inlet_degc: float, count: int) -> Array:
+    """Of `count` rows: the frames at whole seconds."""
+    once = carried(_dbc()["Coolant"].signals, "coolant_degc", np.array([inlet_degc]))[0]
+    return np.where(np.arange(1, count + 1) % 10 == 0, once, np.nan)
 
 
 def sense(lap: Lap, seed: int, faults: Sequence[Fault] = ()) -> Drive:
@@ -85,7 +95,7 @@ def sense(lap: Lap, seed: int, faults: Sequence[Fault] = ()) -> Drive:
     signals = _dbc()["TempMeas"].signals
     names = ("theta_w_meas_degc", "theta_r_meas_degc")
     y = np.stack([carried(signals, name, read[:, k]) for k, name in enumerate(names)], axis=1)
-    return Drive(lap.torque_nm, lap.speed_rpm, lap.u, y)
+    return Drive(lap.torque_nm, lap.speed_rpm, lap.u, y, coolant_degc=lap.coolant_degc)
 
 
 def carried(signals: Sequence[SignalInfo], name: str, values: Array) -> Array:
