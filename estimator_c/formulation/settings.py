@@ -21,13 +21,18 @@ class Field:
     table: str
     key: str
     c_name: str
-    kind: str  # "int" | "float" | "bool" | "pair" (one value per channel: winding, rotor)
+    kind: str  # "int" | "float" | "bool" | "pair" (one value per channel: winding, rotor) | "choice"
     low: float
     high: float
     meaning: str
+    choices: tuple[str, ...] = ()  # of a "choice": the value is the index, in C an enumerator
 
 
+ESTIMATORS = ("mhe", "ekf")
+ARRIVALS = ("smoothed", "filter")
+LOSSES = ("quadratic", "huber", "geman-mcclure")
 FIELDS = (
+    Field("estimator", "kind", "kind", "choice", 0, 1, "whose estimate is published", ESTIMATORS),
     Field("sensor", "delay_steps", "delay_steps", "int", 0, 50, "sensor delay in intervals of 0.1 s"),
     Field("sensor", "offset_degc", "offset_degc", "float", -50, 50, "known sensor offset, subtracted"),
     Field(
@@ -39,9 +44,19 @@ FIELDS = (
         60,
         "status 'predicting' after this long without a measurement",
     ),
+    Field("sensor", "range_low_degc", "range_low_degc", "float", -273.15, 1000, "below: open circuit, no value"),
+    Field("sensor", "range_high_degc", "range_high_degc", "float", -273.15, 1000, "above: short circuit, no value"),
+    Field("sensor", "key_on_calibration", "key_on_calibration", "bool", 0, 1, "measure the offset at key-on"),
+    Field("robust", "loss", "loss", "choice", 0, 2, "loss of a measurement's residual", LOSSES),
+    Field("robust", "loss_scale_degc", "loss_scale_degc", "float", 1e-3, 1e6, "where the loss bends"),
+    Field("robust", "supervise", "supervise", "bool", 0, 1, "watch the sensors and distrust a faulty one"),
+    Field("robust", "gate_sigma", "gate_sigma", "float", 1, 100, "standard deviations beyond which a value is out"),
+    Field("robust", "drift_degc", "drift_degc", PER_CHANNEL, 0.01, 1000, "slow innovation that means drift"),
+    Field("robust", "open_loop_s", "open_loop_s", "float", 1, 3600, "distrust after which the upper bound grows"),
     Field("weights", "measurement", "weight_measurement", PER_CHANNEL, 0, 1e6, "Wy, 1/K^2"),
     Field("weights", "noise", "weight_noise", PER_CHANNEL, 1e-6, 1e9, "Ww, 1/K^2 per interval"),
     Field("weights", "arrival", "weight_arrival", PER_CHANNEL, 1e-9, 1e9, "P0 once the window is full, 1/K^2"),
+    Field("weights", "arrival_from", "arrival_from", "choice", 0, 1, "prior of a full window", ARRIVALS),
     Field("weights", "prior", "weight_prior", PER_CHANNEL, 1e-9, 1e9, "P0 while the window grows, 1/K^2"),
     Field(
         "weights",
@@ -119,8 +134,9 @@ def _load(path: Path) -> Setting:
             if (table, key) not in known:
                 raise FormulationError(path, f"{table}.{key}", "is not a known field", REMEDY)
     values = {field.c_name: _value(path, field, data) for field in FIELDS}
-    if values["lower_degc"] >= values["upper_degc"]:
-        raise FormulationError(path, "bounds", "lower_degc must lie below upper_degc", REMEDY)
+    for table, low, high in (("bounds", "lower_degc", "upper_degc"), ("sensor", "range_low_degc", "range_high_degc")):
+        if values[low] >= values[high]:
+            raise FormulationError(path, table, f"{low} must lie below {high}", REMEDY)
     return Setting(path.stem, title, number, values)
 
 
@@ -133,6 +149,10 @@ def _value(path: Path, field: Field, data: dict[str, Any]) -> Any:
         if type(found) is not bool:
             raise FormulationError(path, where, f"must be true or false, is {found!r}", REMEDY)
         return found
+    if field.kind == "choice":
+        if found not in field.choices:
+            raise FormulationError(path, where, f"must be one of {', '.join(field.choices)}, is {found!r}", REMEDY)
+        return field.choices.index(found)
     if field.kind == PER_CHANNEL:
         if not isinstance(found, list) or len(found) != 2:
             raise FormulationError(path, where, f"must be [winding, rotor], is {found!r}", REMEDY)

@@ -27,7 +27,7 @@ void est_batch_run(estimator_t *self, int64_t intervals, uint16_t first_tick, co
             estimator_feed_motor(self, tick, torque_nm[k * ESTIMATOR_TICKS + j], speed_rpm[k * ESTIMATOR_TICKS + j], true);
         }
         if (coolant_degc != NULL && !isnan(coolant_degc[k])) {
-            estimator_feed_coolant(self, tick, coolant_degc[k], soaked != NULL && soaked[k], true);
+            estimator_feed_coolant(self, coolant_degc[k], soaked != NULL && soaked[k], true);
         }
         const double w = meas[2 * k];
         const double r = meas[2 * k + 1];

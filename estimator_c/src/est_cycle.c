@@ -62,7 +62,7 @@ static void feed(estimator_t *estimator, const est_input *input) {
         estimator_feed_temp(estimator, input->tick, input->temp.theta_w_degc, input->temp.theta_r_degc,
                             input->temp.valid_w, input->temp.valid_r);
     } else {
-        estimator_feed_coolant(estimator, input->tick, input->coolant.coolant_degc, input->coolant.soaked,
+        estimator_feed_coolant(estimator, input->coolant.coolant_degc, input->coolant.soaked,
                                input->coolant.valid);
     }
 }

@@ -10,6 +10,11 @@
 #define START_WAIT 20
 #define FALLBACK_WEIGHT 0.01 /* of a made-up prior: one measurement weighs a thousand times more */
 
+static const double UPPER_SIGMA = 3.0;
+static const double MODEL_VARIANCE = 0.01; /* K^2: a plant that is not quite the one the net knows, see docs/estimator.md */
+static const double MARGIN_DEGC_S = 0.05; /* of the upper bound, after too long without a trusted sensor */
+static const double MARGIN_MAX_DEGC = 10.0;
+
 /* Larger magnitudes are no temperature in degC, torque in Nm or speed in rpm but a broken sender; they would wear off
  * only after a hundred thousand windows. */
 #define ABSURD 1.0e6
@@ -25,17 +30,19 @@ static size_t slot(int64_t k)
     return (size_t)(k & RING_MASK);
 }
 
-/* Everything but the setting and the counters back to the beginning. */
+/* Everything but the setting, the counters and the sensors' offset back to the beginning. */
 static void forget(estimator_t *self)
 {
     const est_setting_t setting = self->setting;
     const estimator_counters_t counters = self->counters;
+    const offset_calibration_t calibration = self->calibration;
     const bool invalid_pending = self->invalid_pending;
     memset(self, 0, sizeof *self);
     self->setting = setting;
     self->counters = counters;
+    self->calibration = calibration;
     self->invalid_pending = invalid_pending;
-    mhe_init(&self->mhe, &self->setting);
+    fusion_init(&self->fusion, &self->setting);
     validity_init(&self->validity);
     for (int k = 0; k < ESTIMATOR_RING; k++) {
         self->measured[k][0] = NAN;
@@ -61,6 +68,7 @@ estimator_error_t estimator_init(estimator_t *self, const est_setting_t *setting
         return ESTIMATOR_BAD_SETTING;
     }
     self->setting = *setting;
+    offset_calibration_init(&self->calibration, setting->offset_degc, setting->delay_steps, setting->key_on_calibration);
     forget(self);
     return ESTIMATOR_OK;
 }
@@ -151,7 +159,8 @@ static void place_measurement(estimator_t *self, int64_t k, int channel, double 
 {
     const int64_t newest_node = self->next_interval - self->setting.delay_steps; /* of the MHE, if started */
     if (self->started && k <= newest_node) {
-        const double innovation = mhe_measure(&self->mhe, (int)(newest_node - k), channel, y);
+        const double raw = y + self->calibration.result.offset_degc[channel];
+        const double innovation = fusion_measure_late(&self->fusion, (int)(newest_node - k), channel, y, raw);
         if (isnan(innovation)) {
             self->counters.late_measurements++;
             return;
@@ -171,7 +180,8 @@ static void place_measurement(estimator_t *self, int64_t k, int channel, double 
 void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc, double theta_r_degc, bool w_valid,
                          bool r_valid)
 {
-    const double y[MHE_CHANNELS] = {theta_w_degc - self->setting.offset_degc, theta_r_degc - self->setting.offset_degc};
+    const double *offset = self->calibration.result.offset_degc;
+    const double y[MHE_CHANNELS] = {theta_w_degc - offset[0], theta_r_degc - offset[1]};
     const bool valid[MHE_CHANNELS] = {w_valid && usable(theta_w_degc), r_valid && usable(theta_r_degc)};
     int64_t tick = self->motor_seen ? unwrap(self->newest_tick, tick16)
                    : self->anchored ? unwrap(self->newest_temp_tick, tick16)
@@ -204,6 +214,11 @@ void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc
     }
     self->off_grid_run = 0;
     self->newest_temp_tick = tick;
+    const double raw[MHE_CHANNELS] = {valid[0] ? theta_w_degc : NAN, valid[1] ? theta_r_degc : NAN};
+    if (offset_calibration_measure(&self->calibration, raw)) {
+        self->started = false; /* at a standstill: the window opens anew with the right offset, at once */
+        return;
+    }
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         if (valid[ch]) {
             self->last_measured_tick[ch] = tick;
@@ -212,9 +227,9 @@ void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc
     }
 }
 
-void estimator_feed_coolant(estimator_t *self, uint16_t tick16, double coolant_degc, bool soaked, bool valid)
+void estimator_feed_coolant(estimator_t *self, double coolant_degc, bool soaked, bool valid)
 {
-    (void)self, (void)tick16, (void)coolant_degc, (void)soaked, (void)valid;
+    offset_calibration_coolant(&self->calibration, valid ? coolant_degc : NAN, soaked && valid);
 }
 
 /* Close interval k: the mean of its frames, or the last input held. */
@@ -239,14 +254,14 @@ static void close_interval(estimator_t *self, int64_t k, bool *stale)
 static void fall_back(estimator_t *self, int ch)
 {
     self->fallback_left[ch] = MHE_NODES;
-    self->mhe.weight_prior[ch] = self->setting.weight_arrival[ch];
+    self->fusion.mhe.weight_prior[ch] = self->setting.weight_arrival[ch];
 }
 
 static void fallback_measured(estimator_t *self, int ch)
 {
     const bool last = --self->fallback_left[ch] == 0;
-    self->mhe.weight_prior[ch] = last ? self->setting.weight_prior[ch] : FALLBACK_WEIGHT;
-    self->mhe.weight_arrival[ch] = last ? self->setting.weight_arrival[ch] : FALLBACK_WEIGHT;
+    self->fusion.mhe.weight_prior[ch] = last ? self->setting.weight_prior[ch] : FALLBACK_WEIGHT;
+    self->fusion.mhe.weight_arrival[ch] = last ? self->setting.weight_arrival[ch] : FALLBACK_WEIGHT;
 }
 
 /* Open the MHE's window at node k once each channel has a measurement to start from, or one of them and a long wait. */
@@ -276,7 +291,7 @@ static bool start_at(estimator_t *self, int64_t k)
     for (int step = 0; step < self->setting.spin_up_steps && first >= 0; step++) {
         net_forward(self->input[slot(first)], prior, memory, memory, rate, tape);
     }
-    mhe_start(&self->mhe, prior, memory);
+    fusion_start(&self->fusion, prior, memory);
     self->started = true;
     return true;
 }
@@ -299,32 +314,30 @@ static void measure_newest(estimator_t *self, int64_t k)
 {
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         const double y = self->measured[slot(k)][ch];
+        const double raw = y + self->calibration.result.offset_degc[ch];
         self->measured[slot(k)][ch] = NAN;
-        if (!isnan(y)) {
-            self->innovation[ch] = mhe_measure(&self->mhe, 0, ch, y);
-            if (self->fallback_left[ch] > 0) {
-                fallback_measured(self, ch);
-            }
+        self->innovation[ch] = fusion_measure(&self->fusion, ch, y, raw, &self->innovation_variance[ch]);
+        if (!isnan(y) && self->fallback_left[ch] > 0) {
+            fallback_measured(self, ch);
         }
     }
 }
 
-/* MHE at the delayed node, then the net forward to node `now` with the stored inputs. */
+/* The estimate at the delayed node, then the net forward to node `now` with the stored inputs. */
 static void solve(estimator_t *self, int64_t now, estimator_out_t *out)
 {
-    mhe_result_t result;
-    const mhe_status_t status = mhe_solve(&self->mhe, &result);
-    const mhe_node_t *node = mhe_node(&self->mhe, 0);
+    fusion_estimate_t estimate;
     double rate[MHE_CHANNELS];
     double tape[NET_TAPE];
     double sum = 0.0;
 
+    fusion_solve(&self->fusion, &estimate);
     self->measurement_pending = false;
-    self->counters.unconverged += status == MHE_MAX_SWEEPS;
-    out->sweeps = result.sweeps > out->sweeps ? result.sweeps : out->sweeps;
-    out->kkt_degc = result.kkt_degc;
-    memcpy(self->theta, node->theta, sizeof self->theta);
-    memcpy(self->memory, node->memory, sizeof self->memory);
+    self->counters.unconverged += estimate.status == MHE_MAX_SWEEPS;
+    out->sweeps = estimate.sweeps > out->sweeps ? estimate.sweeps : out->sweeps;
+    out->kkt_degc = estimate.kkt_degc;
+    memcpy(self->theta, estimate.theta, sizeof self->theta);
+    memcpy(self->memory, estimate.memory, sizeof self->memory);
     for (int64_t k = now - self->setting.delay_steps; k < now; k++) {
         net_forward(self->input[slot(k)], self->theta, self->memory, self->memory, rate, tape);
         for (int ch = 0; ch < MHE_CHANNELS; ch++) {
@@ -332,9 +345,10 @@ static void solve(estimator_t *self, int64_t now, estimator_out_t *out)
         }
     }
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-        sum += self->theta[ch];
+        self->variance[ch] = estimate.variance[ch];
+        sum += self->theta[ch] + self->variance[ch];
     }
-    if (status == MHE_INVALID || !isfinite(sum)) {
+    if (!estimate.usable || !isfinite(sum)) {
         self->invalid_pending = true;
         restart(self);
     }
@@ -361,7 +375,7 @@ static void consume_interval(estimator_t *self, estimator_out_t *out)
             return;
         }
     } else {
-        mhe_advance(&self->mhe, self->input[slot(node - 1)]);
+        fusion_advance(&self->fusion, self->input[slot(node - 1)]);
     }
     measure_newest(self, node);
     solve(self, k + 1, out);
@@ -391,6 +405,27 @@ static void publish_theta(const estimator_t *self, estimator_out_t *out)
     out->theta_r_degc = theta[1];
 }
 
+static double distrusted_s(const sensor_monitor_t *monitor)
+{
+    return monitor->trusted ? 0.0 : NET_DT_S * monitor->distrusted_steps;
+}
+
+/* What is said of a channel beside its estimate. The bound grows once the sensor has been distrusted for long. */
+static estimator_channel_t channel_now(const estimator_t *self, int ch, double theta_degc)
+{
+    const sensor_monitor_t *monitor = &self->fusion.monitor[ch];
+    const double sigma = sqrt(self->variance[ch]);
+    const double beyond_s = fmax(0.0, distrusted_s(monitor) - self->setting.open_loop_s);
+    const double margin = fmin(MARGIN_MAX_DEGC, MARGIN_DEGC_S * beyond_s);
+    return (estimator_channel_t){
+        .fault = monitor->fault,
+        .trusted = self->fusion.share[ch] > 0.0,
+        .sigma_degc = sigma,
+        .upper_degc = theta_degc + UPPER_SIGMA * sqrt(self->variance[ch] + MODEL_VARIANCE) + margin,
+        .innov_sigma_degc = isnan(self->innovation[ch]) ? NAN : sqrt(self->innovation_variance[ch]),
+    };
+}
+
 static estimator_status_t status_now(const estimator_t *self)
 {
     if (!self->started) {
@@ -400,13 +435,18 @@ static estimator_status_t status_now(const estimator_t *self)
     if (self->newest_held || self->newest_temp_tick - self->newest_tick > 2 * ESTIMATOR_TICKS) {
         return ESTIMATOR_INPUT_STALE;
     }
+    bool distrusted = false;
+    bool open_loop = false;
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        const sensor_monitor_t *monitor = &self->fusion.monitor[ch];
         const double age_s = ESTIMATOR_TICK_S * (double)(self->newest_tick - self->last_measured_tick[ch]);
-        if (age_s > self->setting.sensor_timeout_s) {
-            return ESTIMATOR_PREDICTING;
-        }
+        distrusted = distrusted || age_s > self->setting.sensor_timeout_s || !monitor->trusted;
+        open_loop = open_loop || distrusted_s(monitor) > self->setting.open_loop_s;
     }
-    return ESTIMATOR_RUNNING;
+    if (self->fusion.fallback) {
+        return ESTIMATOR_FALLBACK;
+    }
+    return open_loop ? ESTIMATOR_OPEN_LOOP : distrusted ? ESTIMATOR_PREDICTING : ESTIMATOR_RUNNING;
 }
 
 void estimator_step(estimator_t *self, estimator_out_t *out)
@@ -416,7 +456,6 @@ void estimator_step(estimator_t *self, estimator_out_t *out)
         .tick = self->newest_tick, .tick16 = (uint16_t)self->newest_tick};
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         out->channel[ch] = (estimator_channel_t){.sigma_degc = NAN, .upper_degc = NAN, .innov_sigma_degc = NAN};
-        out->calibration.offset_degc[ch] = self->setting.offset_degc;
     }
     while (self->anchored && self->motor_seen &&
            self->newest_tick >= self->grid_tick + ESTIMATOR_TICKS * (self->next_interval + 1)) {
@@ -427,7 +466,10 @@ void estimator_step(estimator_t *self, estimator_out_t *out)
     }
     if (self->started) {
         publish_theta(self, out);
+        out->channel[0] = channel_now(self, 0, out->theta_w_degc);
+        out->channel[1] = channel_now(self, 1, out->theta_r_degc);
     }
+    out->calibration = self->calibration.result;
     out->status = self->invalid_pending ? ESTIMATOR_INVALID : status_now(self);
     self->invalid_pending = false;
     out->stale_input |= out->status == ESTIMATOR_INPUT_STALE;

@@ -14,7 +14,8 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "mhe.h"
+#include "fusion.h"
+#include "offset_calibration.h"
 #include "validity.h"
 
 #define ESTIMATOR_RING 128          /* intervals remembered; a power of two */
@@ -33,18 +34,6 @@ typedef enum {
     ESTIMATOR_FALLBACK = 7,    /* the MHE gave no usable solution: the estimate is the Kalman filter's */
 } estimator_status_t;
 
-/* What the innovations say about a sensor. */
-typedef enum {
-    SENSOR_OK = 0,
-    SENSOR_OFFSET = 1,  /* stepped away and stays there */
-    SENSOR_NOISE = 2,   /* far noisier than it should be */
-    SENSOR_STUCK = 3,   /* the same value again and again */
-    SENSOR_DROPOUT = 4, /* no value, or one no winding can have (open or short circuit) */
-    SENSOR_SPIKE = 5,   /* single values far out */
-    SENSOR_DRIFT = 6,   /* creeps away */
-    SENSOR_SLOW = 7,    /* late or lagging: the innovation follows the rate of change */
-} sensor_class_t;
-
 /* One temperature, beside its estimate. */
 typedef struct {
     sensor_class_t fault;    /* of its sensor */
@@ -53,20 +42,6 @@ typedef struct {
     double upper_degc;       /* conservative upper bound of the temperature; NAN before the first */
     double innov_sigma_degc; /* predicted standard deviation of the innovation; NAN if none came since */
 } estimator_channel_t;
-
-typedef enum {
-    CALIBRATION_DATASHEET = 0, /* the setting's offset is in use */
-    CALIBRATION_MEASURING = 1, /* key-on with the machine at coolant temperature: averaging */
-    CALIBRATION_FROZEN = 2,    /* the measured offset is in use and stays */
-    CALIBRATION_REFUSED = 3,   /* measured, but not believable: the setting's offset stays in use */
-} calibration_state_t;
-
-/* The sensors' offset as it is being subtracted. */
-typedef struct {
-    calibration_state_t state;
-    double offset_degc[MHE_CHANNELS];
-    double sigma_degc[MHE_CHANNELS];
-} estimator_calibration_t;
 
 typedef enum {
     ESTIMATOR_OK = 0,
@@ -108,7 +83,8 @@ typedef struct {
 typedef struct {
     est_setting_t setting;
     estimator_counters_t counters;
-    mhe_t mhe;
+    fusion_t fusion;
+    offset_calibration_t calibration;
 
     /* Time. Node k lies at tick grid_tick + 10 k; interval k follows it. */
     bool anchored, motor_seen;
@@ -137,6 +113,8 @@ typedef struct {
     double memory[NET_MEMORY];
     validity_t validity;
     double innovation[MHE_CHANNELS];   /* not yet published */
+    double innovation_variance[MHE_CHANNELS];
+    double variance[MHE_CHANNELS];     /* of theta, K^2 */
     bool measurement_pending;          /* a late measurement entered the window after its step */
     bool invalid_pending;              /* the next output says ESTIMATOR_INVALID */
     bool newest_held;                  /* the newest consumed interval had no frame */
@@ -156,7 +134,7 @@ void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc
 
 /* Take the coolant temperature, and whether the machine has stood long enough for all of it to have that temperature
  * (soaked). Only the offset calibration at key-on looks at it. Never fails. < 0.1 us. */
-void estimator_feed_coolant(estimator_t *self, uint16_t tick16, double coolant_degc, bool soaked, bool valid);
+void estimator_feed_coolant(estimator_t *self, double coolant_degc, bool soaked, bool valid);
 
 /* Consume every completed interval (one MHE step each, at most max_gap_steps + 1) and publish. Cost: per interval one
  * mhe_solve() and delay_steps net steps; without a completed interval at most one net step, or one re-solve when a

@@ -32,6 +32,8 @@ void mhe_init(mhe_t *self, const est_setting_t *setting)
         self->qp[ch].hard = setting->hard_bounds;
         self->qp[ch].rho = setting->bound_weight;
     }
+    self->loss = setting->loss;
+    self->loss_scale = setting->loss_scale_degc;
     self->lower = setting->lower_degc;
     self->upper = setting->upper_degc;
     self->tolerance = setting->tolerance_degc;
@@ -59,6 +61,13 @@ static void stage_forward(mhe_t *self, int k)
     mhe_node_t *from = at(self, k);
     mhe_node_t *to = at(self, k + 1);
     net_forward(from->u, from->theta, from->memory, to->memory, from->rate, from->tape);
+}
+
+static void forward_sweep(mhe_t *self)
+{
+    for (int k = 0; k + 1 < self->count; k++) {
+        stage_forward(self, k);
+    }
 }
 
 /* 1 + dt dF/dtheta enters the matrix only, so it is taken once, when the stage is new. Kept positive so that the
@@ -94,15 +103,44 @@ void mhe_advance(mhe_t *self, const double u[2])
     }
 }
 
-double mhe_measure(mhe_t *self, int age, int channel, double y)
+void mhe_arrival(mhe_t *self, const double prior[MHE_CHANNELS], const double weight[MHE_CHANNELS], const double memory[])
+{
+    memcpy(self->prior, prior, sizeof self->prior);
+    memcpy(self->weight_arrival, weight, sizeof self->weight_arrival);
+    if (memory != NULL) {
+        mhe_node_t *oldest = at(self, 0);
+        memcpy(oldest->memory, memory, sizeof oldest->memory);
+        forward_sweep(self);
+    }
+}
+
+double mhe_measure(mhe_t *self, int age, int channel, double y, double share)
 {
     if (age < 0 || age >= self->count || channel < 0 || channel >= MHE_CHANNELS || !isfinite(y)) {
         return NAN;
     }
     mhe_node_t *node = at(self, self->count - 1 - age);
     node->y[channel] = y;
-    node->weight[channel] = self->weight_measurement[channel];
+    node->weight[channel] = share * self->weight_measurement[channel];
     return y - node->theta[channel];
+}
+
+void mhe_forget(mhe_t *self, int channel, int nodes)
+{
+    for (int k = self->count - 1; k >= 0 && k >= self->count - nodes; k--) {
+        at(self, k)->weight[channel] = 0.0;
+    }
+}
+
+void mhe_shift(mhe_t *self, int channel, double shift)
+{
+    for (int k = 0; k < self->count; k++) {
+        at(self, k)->theta[channel] += shift;
+    }
+    self->prior[channel] += shift;
+    if (self->count > 0) {
+        forward_sweep(self); /* mhe_solve() expects the stages to be up to date */
+    }
 }
 
 const mhe_node_t *mhe_node(const mhe_t *self, int age)
@@ -113,11 +151,26 @@ const mhe_node_t *mhe_node(const mhe_t *self, int age)
     return &self->node[(self->head + self->count - 1 - age) & (MHE_NODES - 1)];
 }
 
-static void forward_sweep(mhe_t *self)
+/* Weight of residual r under the loss: the derivative of rho over r. 1 where r is small; Huber 1965, Geman and McClure 1987. */
+static double loss_weight(const mhe_t *self, double r)
 {
-    for (int k = 0; k + 1 < self->count; k++) {
-        stage_forward(self, k);
+    const double x = r / self->loss_scale;
+    if (self->loss == EST_LOSS_GEMAN_MCCLURE) {
+        const double d = 1.0 + x * x;
+        return 1.0 / (d * d);
     }
+    return self->loss == EST_LOSS_HUBER ? 1.0 / fmax(1.0, fabs(x)) : 1.0;
+}
+
+/* The loss itself over its scale squared is rho(x); here times the scale squared, 1/2 r^2 where r is small. */
+static double loss_value(const mhe_t *self, double r)
+{
+    const double s = self->loss_scale;
+    const double x = fabs(r / s);
+    if (self->loss == EST_LOSS_GEMAN_MCCLURE) {
+        return 0.5 * r * r / (1.0 + x * x);
+    }
+    return self->loss == EST_LOSS_HUBER && x > 1.0 ? s * s * (x - 0.5) : 0.5 * r * r;
 }
 
 /* Gradient of the cost at the point of the last forward sweep, into qp[].gradient. */
@@ -142,8 +195,9 @@ static void adjoint_sweep(mhe_t *self)
             net_adjoint(node->tape, node->memory, rate_bar, memory_bar, theta_bar, memory_bar);
         }
         for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+            const double residual = node->theta[ch] - node->y[ch];
             self->qp[ch].gradient[k] =
-                theta_bar[ch] - pull[ch] + weight_at(self, k, ch) * (node->theta[ch] - node->y[ch]);
+                theta_bar[ch] - pull[ch] + weight_at(self, k, ch) * loss_weight(self, residual) * residual;
         }
     }
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
@@ -151,7 +205,8 @@ static void adjoint_sweep(mhe_t *self)
     }
 }
 
-/* Gauss-Newton matrix of each channel with the direct slope of each stage; constant within a step. */
+/* Gauss-Newton matrix of each channel with the direct slope of each stage; constant within a step unless the loss weighs
+ * the residuals anew. */
 static void factor(mhe_t *self)
 {
     const double *p0 = arrival_weight(self);
@@ -163,7 +218,8 @@ static void factor(mhe_t *self)
             const double a = at(self, k)->slope[ch];
             const double leaving = k + 1 < self->count ? ww * a * a : 0.0;
             const double arriving = k > 0 ? ww : p0[ch];
-            qp->diag[k] = arriving + leaving + weight_at(self, k, ch);
+            const double residual = at(self, k)->theta[ch] - at(self, k)->y[ch];
+            qp->diag[k] = arriving + leaving + weight_at(self, k, ch) * loss_weight(self, residual);
             qp->off[k] = -ww * a;
         }
         box_qp_factor(qp);
@@ -200,10 +256,12 @@ mhe_status_t mhe_solve(mhe_t *self, mhe_result_t *result)
         return MHE_INVALID;
     }
     mhe_status_t status = MHE_MAX_SWEEPS;
-    factor(self);
     /* The stages are up to date on entry: old ones from the last solve, the newest from mhe_advance(). */
     while (result->sweeps < self->max_sweeps) {
         bool settled = true;
+        if (result->sweeps == 0 || self->loss != EST_LOSS_QUADRATIC) {
+            factor(self);
+        }
         adjoint_sweep(self);
         result->kkt_degc = tridiagonal_step(self, step, &result->active, &settled);
         result->sweeps++;
@@ -242,7 +300,7 @@ double mhe_cost(mhe_t *self, double gradient[][MHE_CHANNELS])
         for (int k = 0; k < self->count; k++) {
             const mhe_node_t *node = at(self, k);
             const double residual = node->theta[ch] - node->y[ch];
-            cost += 0.5 * weight_at(self, k, ch) * residual * residual;
+            cost += weight_at(self, k, ch) * loss_value(self, residual);
             if (k + 1 < self->count) {
                 const double w = at(self, k + 1)->theta[ch] - node->theta[ch] - NET_DT_S * node->rate[ch];
                 cost += 0.5 * self->weight_noise[ch] * w * w;

@@ -1,9 +1,9 @@
 /* Moving horizon estimation of winding and rotor temperature with the trained net as its model.
  *
  *   theta_{k+1} = theta_k + dt F(u_k, theta_k, c_k, h_k) + w_k,   (c, h)_{k+1} = LSTM(u_k, theta_k, c_k, h_k)
- *   min 1/2 |theta_0 - prior|^2_P0 + 1/2 sum |y_k - theta_k|^2_Wy + 1/2 sum |w_k|^2_Ww   over up to 16 nodes
+ *   min 1/2 |theta_0 - prior|^2_P0 + sum Wy rho(y_k - theta_k) + 1/2 sum |w_k|^2_Ww   over up to 16 nodes
  *
- * with c_0, h_0 given. w is eliminated, so the unknowns are theta_0..theta_15 alone; c and h follow by recursion.
+ * with c_0, h_0 given and rho the loss of a measurement: quadratic, Huber's or Geman and McClure's. w is eliminated, so the unknowns are theta_0..theta_15 alone; c and h follow by recursion.
  * Each sweep: the net forward over the window, its exact adjoint backward (hence the exact gradient), one
  * tridiagonal solve per channel with the Gauss-Newton matrix that keeps each stage's direct slope but leaves out what
  * passes through the net's memory. Its fixed point is the exact KKT point of the problem above.
@@ -46,6 +46,8 @@ typedef struct {
     double weight_arrival[MHE_CHANNELS];
     double weight_prior[MHE_CHANNELS];
     double lower, upper, tolerance;
+    double loss_scale;           /* degC, of Huber's and Geman and McClure's loss */
+    int loss;                    /* EST_LOSS_... of est_settings.h */
     int max_sweeps;
     bool newest_measurement;
 
@@ -70,13 +72,24 @@ void mhe_init(mhe_t *self, const est_setting_t *setting);
 /* Begin a window of one node with that prior and that memory of the net (NET_MEMORY). Never fails. */
 void mhe_start(mhe_t *self, const double prior[MHE_CHANNELS], const double memory[]);
 
-/* Append a node: the newest one plus one step of the net with u = [speed rpm, torque Nm]. A full window drops its
- * oldest node; the prior becomes the last solution at the new oldest node, whose memory is kept. One net step. */
+/* Append a node: the newest one plus one step of the net with u = [speed rpm, torque Nm]. A full window drops its oldest node; the prior becomes the last solution at the new oldest node, whose
+ * memory is kept. One net step. */
 void mhe_advance(mhe_t *self, const double u[2]);
 
-/* Attach measurement y (offset removed) to the node `age` steps before the newest and return the innovation: y minus
- * what the window said before. A node outside the window or a value that is not finite is ignored: returns NAN. */
-double mhe_measure(mhe_t *self, int age, int channel, double y);
+/* Another prior of the oldest node, and its weights (1/K^2), in place of the last solution there and the setting's; memory: of
+ * the net there, NULL to keep it (else one forward pass). For a full window, after mhe_advance(). */
+void mhe_arrival(mhe_t *self, const double prior[MHE_CHANNELS], const double weight[MHE_CHANNELS], const double memory[]);
+
+/* Attach measurement y (offset removed) to the node `age` steps before the newest, with `share` (0..1) of the setting's
+ * weight. Returns the innovation: y minus what the window said before; attaches nothing and returns NAN for a node
+ * outside the window or a value that is not finite. */
+double mhe_measure(mhe_t *self, int age, int channel, double y, double share);
+
+/* Take back the measurements of the newest `nodes` nodes: they turned out to be worth nothing. */
+void mhe_forget(mhe_t *self, int channel, int nodes);
+
+/* Move the whole window of one channel by `shift` degC: the level was wrong, the course was not. */
+void mhe_shift(mhe_t *self, int channel, double shift);
 
 /* Solve from the present window. Cost: (sweeps - 1) forward passes and `sweeps` adjoint passes over the window. */
 mhe_status_t mhe_solve(mhe_t *self, mhe_result_t *result);

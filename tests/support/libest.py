@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = (
-    "src/mhe.c", "src/estimator.c", "src/validity.c", "src/est_batch.c", "src/solver/tridiag.c", "src/solver/box_qp.c",
-)  # fmt: skip
+CORE = ("mhe", "ekf", "slow_observer", "sensor_monitor", "fusion", "offset_calibration", "estimator", "validity")
+SOURCES = (*(f"src/{name}.c" for name in CORE), "src/est_batch.c", "src/solver/tridiag.c", "src/solver/box_qp.c")
 SETTINGS = ROOT / "estimator_c" / "settings"
 WEIGHTS = ROOT / "estimator_c" / "weights" / "lstm8.json"
 NODES = 16
@@ -32,9 +31,13 @@ class Setting(ct.Structure):
     """est_setting_t of the generated est_settings.h (checked against the schema by `load`)."""
 
     _fields_ = (
-        ("name", ct.c_char_p), ("id", ct.c_int32),
+        ("name", ct.c_char_p), ("id", ct.c_int32), ("kind", ct.c_int32),
         ("delay_steps", ct.c_int32), ("offset_degc", f64), ("sensor_timeout_s", f64),
-        ("weight_measurement", pair), ("weight_noise", pair), ("weight_arrival", pair), ("weight_prior", pair),
+        ("range_low_degc", f64), ("range_high_degc", f64), ("key_on_calibration", ct.c_bool),
+        ("loss", ct.c_int32), ("loss_scale_degc", f64), ("supervise", ct.c_bool), ("gate_sigma", f64),
+        ("drift_degc", pair), ("open_loop_s", f64),
+        ("weight_measurement", pair), ("weight_noise", pair), ("weight_arrival", pair),
+        ("arrival_from", ct.c_int32), ("weight_prior", pair),
         ("newest_measurement", ct.c_bool), ("hard_bounds", ct.c_bool),
         ("lower_degc", f64), ("upper_degc", f64), ("bound_weight", f64),
         ("max_sweeps", ct.c_int32), ("tolerance_degc", f64),
@@ -293,8 +296,8 @@ class Estimator:
         self._step(self.memory, ct.byref(self._out))
         return Out.from_buffer_copy(self._out)
 
-    def feed_coolant(self, tick: int, coolant_degc: float, soaked: bool, valid: bool = True) -> None:
-        self.lib.c.estimator_feed_coolant(self.memory, ct.c_uint16(tick & 0xFFFF), f64(coolant_degc), soaked, valid)
+    def feed_coolant(self, coolant_degc: float, soaked: bool, valid: bool = True) -> None:
+        self.lib.c.estimator_feed_coolant(self.memory, f64(coolant_degc), ct.c_bool(soaked), ct.c_bool(valid))
 
     def run(
         self,

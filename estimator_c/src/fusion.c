@@ -1,0 +1,189 @@
+#include "fusion.h"
+
+#include <math.h>
+#include <string.h>
+
+static const double START_VARIANCE = 10.0;    /* K^2, where the prior says next to nothing */
+static const double CREEP_VARIANCE = 0.25;    /* K^2, of the slow observer's level */
+static const double USABLE_KKT_DEGC = 0.01;   /* an MHE cut short is still used below this */
+static const int32_t MEMORY_STEPS = 200;      /* 20 s: until then the filter still learns what the net should remember */
+
+void fusion_init(fusion_t *self, const est_setting_t *setting)
+{
+    memset(self, 0, sizeof *self);
+    self->setting = *setting;
+    mhe_init(&self->mhe, setting);
+    ekf_init(&self->ekf, setting);
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        sensor_monitor_init(&self->monitor[ch], setting, ch);
+    }
+}
+
+void fusion_start(fusion_t *self, const double prior[MHE_CHANNELS], const double memory[])
+{
+    const double variance[MHE_CHANNELS] = {START_VARIANCE, START_VARIANCE};
+    mhe_start(&self->mhe, prior, memory);
+    ekf_start(&self->ekf, prior, variance, memory);
+    slow_observer_start(&self->slow, prior, memory);
+    self->steps = 0;
+}
+
+static bool uses_mhe(const fusion_t *self)
+{
+    return self->setting.kind == EST_KIND_MHE;
+}
+
+/* Arrival cost: the filter's prediction of the oldest node says what all measurements before the window say. With it the MHE
+ * begins where the filter stood, and no measurement counts twice. */
+static void begin_at_oldest(fusion_t *self)
+{
+    if (!uses_mhe(self) || self->setting.arrival_from != EST_ARRIVAL_FROM_FILTER || !self->mhe.full) {
+        return;
+    }
+    const fusion_prediction_t *oldest = &self->predicted[(self->newest + 1) % MHE_NODES];
+    double weight[MHE_CHANNELS];
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        weight[ch] = 1.0 / oldest->variance[ch];
+    }
+    mhe_arrival(&self->mhe, oldest->theta, weight, self->steps < MEMORY_STEPS ? oldest->memory : NULL);
+}
+
+/* Note the filter's prediction of the newest node. */
+static void hand_over(fusion_t *self)
+{
+    self->newest = (self->newest + 1) % MHE_NODES;
+    fusion_prediction_t *now = &self->predicted[self->newest];
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        now->theta[ch] = self->ekf.theta[ch];
+        now->variance[ch] = self->ekf.p[ch][ch];
+    }
+    memcpy(now->memory, self->ekf.memory, sizeof now->memory);
+    self->steps++;
+    begin_at_oldest(self);
+}
+
+void fusion_advance(fusion_t *self, const double u[2])
+{
+    if (uses_mhe(self)) {
+        mhe_advance(&self->mhe, u);
+    }
+    ekf_predict(&self->ekf, u);
+    hand_over(self);
+    slow_observer_predict(&self->slow, u);
+}
+
+static double prediction(const fusion_t *self, int channel)
+{
+    return uses_mhe(self) ? mhe_node(&self->mhe, 0)->theta[channel] : self->ekf.theta[channel];
+}
+
+/* The level of a channel was wrong by `shift`. */
+static void move_level(fusion_t *self, int channel, double shift, double variance)
+{
+    if (uses_mhe(self)) {
+        mhe_shift(&self->mhe, channel, shift);
+    }
+    ekf_shift(&self->ekf, channel, shift, variance);
+    for (int age = 0; age < MHE_NODES; age++) { /* what the window said, moved, is now all there is to begin from */
+        const mhe_node_t *node = mhe_node(&self->mhe, age);
+        fusion_prediction_t *then = &self->predicted[(self->newest + MHE_NODES - age) % MHE_NODES];
+        then->theta[channel] = node != NULL ? node->theta[channel] : self->ekf.theta[channel];
+        then->variance[channel] = variance;
+    }
+    begin_at_oldest(self);
+}
+
+/* Let the monitor judge the value; returns its share. *y is moved by what the monitor knows it to be off. */
+static double judge(fusion_t *self, int channel, double *y, double raw)
+{
+    const double now = prediction(self, channel);
+    const monitor_input_t input = {
+        .y = *y,
+        .raw = raw,
+        .residual = *y - now,
+        .variance = self->ekf.p[channel][channel],
+        .slow = self->slow.innovation[channel],
+        .slow_raw = self->slow.raw[channel],
+        .rate = self->slow.rate[channel],
+    };
+    const monitor_verdict_t verdict = sensor_monitor_step(&self->monitor[channel], &input);
+    if (verdict.forget > 0 && uses_mhe(self)) {
+        mhe_forget(&self->mhe, channel, verdict.forget);
+    }
+    if (verdict.creep) {
+        move_level(self, channel, self->slow.theta[channel] - now, CREEP_VARIANCE);
+    }
+    if (verdict.resume) {
+        move_level(self, channel, verdict.level, self->ekf.r[channel] / 10.0);
+        slow_observer_shift(&self->slow, channel, now + verdict.level - self->slow.theta[channel]);
+    }
+    *y -= verdict.offset;
+    return verdict.share;
+}
+
+double fusion_measure(fusion_t *self, int channel, double y, double raw, double *variance)
+{
+    const double innovation = y - prediction(self, channel);
+    *variance = self->ekf.p[channel][channel] + self->ekf.r[channel];
+    slow_observer_measure(&self->slow, channel, y);
+    const double share = self->setting.supervise ? judge(self, channel, &y, raw) : isfinite(y) ? 1.0 : 0.0;
+    self->share[channel] = share;
+    if (uses_mhe(self)) {
+        (void)mhe_measure(&self->mhe, 0, channel, y, share);
+    }
+    ekf_update(&self->ekf, channel, y, share);
+    slow_observer_follow(&self->slow, channel, share);
+    return innovation;
+}
+
+double fusion_measure_late(fusion_t *self, int age, int channel, double y, double raw)
+{
+    if (!uses_mhe(self)) {
+        return NAN; /* a filter has no way back */
+    }
+    const mhe_node_t *node = mhe_node(&self->mhe, age);
+    if (node == NULL) {
+        return NAN;
+    }
+    const double variance = self->ekf.p[channel][channel];
+    const double share = self->setting.supervise
+                             ? sensor_monitor_late(&self->monitor[channel], raw, y - node->theta[channel], variance)
+                             : 1.0;
+    return mhe_measure(&self->mhe, age, channel, y, share);
+}
+
+static bool ekf_finite(const ekf_t *ekf)
+{
+    double sum = 0.0;
+    for (int ch = 0; ch < EKF_CHANNELS; ch++) {
+        sum += ekf->theta[ch] + ekf->p[ch][ch];
+    }
+    for (int k = 0; k < NET_MEMORY; k++) {
+        sum += ekf->memory[k];
+    }
+    return isfinite(sum);
+}
+
+void fusion_solve(fusion_t *self, fusion_estimate_t *estimate)
+{
+    mhe_result_t result = {.kkt_degc = NAN};
+    *estimate = (fusion_estimate_t){.status = MHE_OK};
+    bool solved = false;
+    if (uses_mhe(self)) {
+        estimate->status = mhe_solve(&self->mhe, &result);
+        solved = estimate->status == MHE_OK ||
+                 (estimate->status == MHE_MAX_SWEEPS && result.kkt_degc < USABLE_KKT_DEGC);
+    }
+    estimate->kkt_degc = result.kkt_degc;
+    estimate->sweeps = result.sweeps;
+    estimate->usable = solved || ekf_finite(&self->ekf);
+    self->fallback = uses_mhe(self) && !solved;
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        estimate->theta[ch] = solved ? result.theta[ch] : self->ekf.theta[ch];
+        estimate->variance[ch] = self->ekf.p[ch][ch];
+    }
+    estimate->memory = solved ? mhe_node(&self->mhe, 0)->memory : self->ekf.memory;
+    if (estimate->status == MHE_INVALID && estimate->usable) {
+        mhe_start(&self->mhe, self->ekf.theta, self->ekf.memory); /* a window that is not finite stays so */
+    }
+}

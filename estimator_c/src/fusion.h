@@ -1,0 +1,70 @@
+/* Net and measurements become one estimate, at the node the newest measurement speaks for.
+ *
+ *   u ─→ MHE, EKF, slow observer one step ahead ─→ monitor per sensor: what is this value worth?
+ *                                                      └→ MHE solves │ EKF updates │ slow observer compares
+ *
+ * The MHE's estimate is published; the EKF gives the variance, and the estimate where the MHE has none or the setting says
+ * so. All see the same shares of the same values.
+ *
+ * No allocation, no clock, no printing; one thread at a time per object; the caller owns it (17 kB with 8 cells). */
+#ifndef FUSION_H
+#define FUSION_H
+
+#include <stdbool.h>
+
+#include "ekf.h"
+#include "mhe.h"
+#include "sensor_monitor.h"
+#include "slow_observer.h"
+
+/* What the filter said of a node before its measurement. */
+typedef struct {
+    double theta[MHE_CHANNELS];
+    double variance[MHE_CHANNELS]; /* K^2 */
+    double memory[NET_MEMORY];
+} fusion_prediction_t;
+
+typedef struct {
+    est_setting_t setting;
+    mhe_t mhe;
+    ekf_t ekf;
+    fusion_prediction_t predicted[MHE_NODES]; /* of the window's nodes, a ring: arrival cost of the MHE */
+    int32_t newest;              /* in the ring */
+    int32_t steps;               /* since the start */
+    slow_observer_t slow;
+    sensor_monitor_t monitor[MHE_CHANNELS];
+    double share[MHE_CHANNELS];  /* of the newest value; 0: not used */
+    bool fallback;               /* the last estimate is the EKF's in place of the MHE's */
+} fusion_t;
+
+/* The estimate at the newest node. */
+typedef struct {
+    double theta[MHE_CHANNELS];
+    double variance[MHE_CHANNELS]; /* K^2 */
+    const double *memory;          /* of the net, NET_MEMORY; valid until the next call */
+    mhe_status_t status;           /* of the MHE; MHE_OK if it was not asked */
+    double kkt_degc;               /* see mhe.h; NAN if it was not asked */
+    int sweeps;
+    bool usable;                   /* false: nothing finite, begin again */
+} fusion_estimate_t;
+
+/* Take a setting; nothing known. Never fails. */
+void fusion_init(fusion_t *self, const est_setting_t *setting);
+
+/* Begin at that temperature and memory of the net. Never fails. */
+void fusion_start(fusion_t *self, const double prior[MHE_CHANNELS], const double memory[]);
+
+/* One step of the net with u = [speed rpm, torque Nm]. Never fails. */
+void fusion_advance(fusion_t *self, const double u[2]);
+
+/* The value of a channel for the newest node, offset removed (NAN: none), and as the sensor gave it. Once per step and
+ * channel. Returns the innovation (NAN: none) and its predicted variance. */
+double fusion_measure(fusion_t *self, int channel, double y, double raw, double *variance);
+
+/* A value for a node `age` steps back, which came after that node's step. Returns the innovation; NAN: too late. */
+double fusion_measure_late(fusion_t *self, int age, int channel, double y, double raw);
+
+/* Solve and give the estimate at the newest node. */
+void fusion_solve(fusion_t *self, fusion_estimate_t *estimate);
+
+#endif

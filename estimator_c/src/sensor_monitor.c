@@ -1,0 +1,320 @@
+#include "sensor_monitor.h"
+
+#include <math.h>
+#include <string.h>
+
+static const int32_t REBASE = 20;            /* values that give the size of a step */
+static const double REBASED_SHARE = 0.005;    /* of a value's weight afterwards: followed over ten seconds */
+static const int32_t REBASE_HOLD = 1200;     /* steps, 2 min: later the net alone knows better than a step measured then */
+static const double STEP_S = 0.1;
+static const int32_t MISSING_LIMIT = 3;      /* values in a row: one or two may be late on the bus */
+static const int32_t SPIKE_HOLD = 10;        /* 1 s */
+static const double EQUAL_USUAL = 0.1;       /* a sensor that repeats itself this often has no noise to go by */
+static const double STUCK_MOVE_DEGC = 1.0;   /* then: how far the prediction must have moved meanwhile */
+static const double NOISE_ON = 3.0;          /* spread over what it should be */
+static const double NOISE_OFF = 1.6;
+static const double SLOW_MEMORY = 1.0 / 150.0; /* 15 s */
+static const double SLOW_LAG_S = 1.5;        /* slope of the slow innovation over the rate */
+static const double SLOW_EFFECT_DEGC = 0.5;  /* and what it must amount to */
+static const double SLOW_CORRELATION2 = 0.5;
+static const double DRIFT_USUAL = 1.45;      /* times what is usual */
+static const int32_t USUAL_BLOCK = 100;      /* 10 s; what is usual is MONITOR_PENDING blocks old: a drift shows meanwhile */
+static const double USUAL_KEEP = 0.998;      /* per block: 80 min */
+static const int32_t WARM_UP = 600;          /* steps before drift is judged */
+static const int32_t CALM_SHORT = 20, CALM_STEP = 30, CALM_CREEP = 100; /* steps before trust returns */
+static const double PLAUSIBLE_DEGC = 0.3;    /* and how far the level may be off, beside 3 sigma of the prediction */
+static const double CREEP_DEGC = 0.6;        /* the same after a creeping fault ... */
+static const double CREEP_DEGC_S = 0.015;    /* ... and how that widens: what still creeps must stay outside */
+
+void sensor_monitor_init(sensor_monitor_t *self, const est_setting_t *setting, int channel)
+{
+    memset(self, 0, sizeof *self);
+    self->r = 1.0 / fmax(1e-9, setting->weight_measurement[channel]);
+    self->spread_r = self->r;
+    self->gate = setting->gate_sigma;
+    self->drift = setting->drift_degc[channel];
+    self->range_low = setting->range_low_degc;
+    self->range_high = setting->range_high_degc;
+    self->trusted = true;
+    self->last_y = NAN;
+}
+
+/* Median of n <= MONITOR_HISTORY values; sorts them. */
+static double median(double values[], int n)
+{
+    for (int i = 1; i < n; i++) {
+        const double v = values[i];
+        int j = i;
+        for (; j > 0 && values[j - 1] > v; j--) {
+            values[j] = values[j - 1];
+        }
+        values[j] = v;
+    }
+    return n % 2 ? values[n / 2] : 0.5 * (values[n / 2 - 1] + values[n / 2]);
+}
+
+/* Median and spread (1.4826 times the median absolute deviation) of the newest n residuals. */
+static double level_of(const sensor_monitor_t *self, int n, double *spread)
+{
+    double values[MONITOR_HISTORY];
+    n = n < self->count ? n : self->count;
+    if (n == 0) {
+        *spread = 0.0;
+        return 0.0;
+    }
+    for (int k = 0; k < n; k++) {
+        values[k] = self->residual[(self->next + MONITOR_HISTORY - 1 - k) % MONITOR_HISTORY];
+    }
+    const double middle = median(values, n);
+    for (int k = 0; k < n; k++) {
+        values[k] = fabs(values[k] - middle);
+    }
+    *spread = 1.4826 * median(values, n);
+    return middle;
+}
+
+static void remember(sensor_monitor_t *self, double residual, double variance)
+{
+    self->residual[self->next] = residual;
+    self->variance[self->next] = variance;
+    self->next = (self->next + 1) % MONITOR_HISTORY;
+    self->count += self->count < MONITOR_HISTORY;
+}
+
+static void distrust(sensor_monitor_t *self, sensor_class_t fault)
+{
+    if (self->trusted) {
+        self->distrusted_steps = 0;
+    }
+    self->trusted = false;
+    self->fault = fault;
+    self->since_change = 0;
+    self->since_step = 0;
+    self->rebased = false;
+    self->spread_r = self->r;
+    memset(self->moment, 0, sizeof self->moment);
+    self->moment_weight = 0.0;
+}
+
+static void trust(sensor_monitor_t *self)
+{
+    self->trusted = true;
+    self->fault = SENSOR_OK;
+    self->run = 0;
+    self->last_inside = 0.0;
+    self->count = 0; /* residuals against a prediction that has just been moved */
+}
+
+/* Slope of the slow innovation over the rate of change: how late the sensor is, in s. */
+static bool is_slow(sensor_monitor_t *self, const monitor_input_t *in)
+{
+    const double sample[5] = {in->slow_raw, in->rate, in->slow_raw * in->slow_raw, in->rate * in->rate,
+                              in->slow_raw * in->rate};
+    const double keep = 1.0 - SLOW_MEMORY;
+    self->moment_weight = keep * self->moment_weight + SLOW_MEMORY;
+    for (int k = 0; k < 5; k++) {
+        self->moment[k] = keep * self->moment[k] + SLOW_MEMORY * sample[k];
+    }
+    if (self->moment_weight < 0.3) {
+        return false;
+    }
+    double mean[5];
+    for (int k = 0; k < 5; k++) {
+        mean[k] = self->moment[k] / self->moment_weight;
+    }
+    const double var_slow = mean[2] - mean[0] * mean[0];
+    const double var_rate = mean[3] - mean[1] * mean[1];
+    const double cov = mean[4] - mean[0] * mean[1];
+    if (var_rate <= 1e-8 || var_slow <= 0.0) {
+        return false;
+    }
+    const double lag_s = -cov / var_rate;
+    return lag_s > SLOW_LAG_S && lag_s * sqrt(var_rate) > SLOW_EFFECT_DEGC &&
+           cov * cov > SLOW_CORRELATION2 * var_slow * var_rate;
+}
+
+/* The slow innovation is never zero, as no model is right; what it has been up to earlier in this drive is no drift. */
+static bool is_drift(sensor_monitor_t *self, const monitor_input_t *in)
+{
+    const double size = fabs(in->slow);
+    const bool found = self->steps > WARM_UP && size > fmax(self->drift, DRIFT_USUAL * self->usual);
+    double *pending = self->pending;
+    pending[0] = fmax(pending[0], size);
+    if (++self->steps % USUAL_BLOCK == 0) {
+        self->usual = fmax(USUAL_KEEP * self->usual, pending[MONITOR_PENDING - 1]);
+        memmove(pending + 1, pending, (MONITOR_PENDING - 1) * sizeof *pending);
+        pending[0] = 0.0;
+    }
+    return found;
+}
+
+/* No value, or none that can be. */
+static monitor_verdict_t absent(sensor_monitor_t *self, bool out_of_range)
+{
+    self->missing++;
+    self->equal = 0;
+    self->last_y = NAN;
+    if (out_of_range || self->missing >= MISSING_LIMIT) {
+        distrust(self, SENSOR_DROPOUT);
+    }
+    return (monitor_verdict_t){0};
+}
+
+static bool is_stuck(sensor_monitor_t *self, const monitor_input_t *in)
+{
+    const bool same = in->y == self->last_y;
+    const double prediction = in->y - in->residual;
+    if (!same) {
+        self->equal = 0;
+        self->run_prediction = prediction;
+    } else {
+        self->equal++;
+    }
+    self->last_y = in->y;
+    if (self->trusted && self->equal < MONITOR_RUN) {
+        self->equal_share += 0.005 * ((same ? 1.0 : 0.0) - self->equal_share);
+    }
+    const bool silent = self->equal_share > EQUAL_USUAL;
+    return self->equal >= MONITOR_RUN - 1 && (!silent || fabs(prediction - self->run_prediction) > STUCK_MOVE_DEGC);
+}
+
+/* A value of a sensor that is believed so far. */
+static monitor_verdict_t judge_trusted(sensor_monitor_t *self, const monitor_input_t *in)
+{
+    double spread;
+    const double level = level_of(self, MONITOR_SPREAD, &spread);
+    const bool noisy = self->fault == SENSOR_NOISE;
+    const double usual = sqrt(self->r + in->variance);
+    if (!noisy && self->count >= 10 && spread > NOISE_ON * usual) {
+        self->fault = SENSOR_NOISE;
+        self->spread_r = spread * spread;
+    } else if (noisy) {
+        self->spread_r = fmax(self->r, self->spread_r + 0.05 * (spread * spread - self->spread_r));
+        if (self->count == MONITOR_HISTORY && spread < NOISE_OFF * usual) {
+            self->fault = SENSOR_OK;
+            self->spread_r = self->r;
+        }
+    }
+    const double sigma = sqrt(self->spread_r + in->variance);
+    const double share = self->r / self->spread_r;
+    if (self->fault == SENSOR_NOISE && self->count >= 10 && fabs(level) > 1.3 * spread && fabs(level) > 4.0 * usual) {
+        distrust(self, SENSOR_OFFSET);
+        return (monitor_verdict_t){.forget = 10};
+    }
+    const bool outside = fabs(in->residual) > self->gate * sigma;
+    if (!outside) {
+        self->run = 0;
+        self->last_inside = in->residual;
+        self->spike_hold -= self->spike_hold > 0;
+        if (self->fault == SENSOR_SPIKE && self->spike_hold == 0) {
+            self->fault = SENSOR_OK;
+        }
+    } else {
+        const int32_t side = in->residual > 0.0 ? 1 : -1;
+        self->run = self->run * side > 0 ? self->run + side : side;
+        self->spike_hold = SPIKE_HOLD;
+        if (self->fault == SENSOR_OK) {
+            self->fault = SENSOR_SPIKE;
+        }
+        if (self->run * side >= MONITOR_RUN && self->fault != SENSOR_NOISE) {
+            double run_spread;
+            const double run_level = level_of(self, MONITOR_RUN, &run_spread);
+            const bool jumped = fabs(run_level - self->last_inside) > self->gate * sqrt(self->r);
+            if (run_spread < NOISE_ON * usual) {
+                distrust(self, jumped ? SENSOR_OFFSET : SENSOR_SLOW);
+                return (monitor_verdict_t){.forget = MONITOR_RUN};
+            }
+        }
+    }
+    const bool slow = is_slow(self, in);
+    const bool drift = is_drift(self, in);
+    if (self->fault == SENSOR_OK && (slow || drift)) {
+        distrust(self, slow ? SENSOR_SLOW : SENSOR_DRIFT);
+        return (monitor_verdict_t){.forget = MONITOR_HISTORY, .creep = true};
+    }
+    return (monitor_verdict_t){.share = outside ? 0.0 : share};
+}
+
+static int32_t calm_needed(const sensor_monitor_t *self)
+{
+    switch (self->fault) {
+    case SENSOR_DRIFT:
+    case SENSOR_SLOW:
+        return CALM_CREEP;
+    case SENSOR_OFFSET:
+        return CALM_STEP;
+    default:
+        return CALM_SHORT;
+    }
+}
+
+/* A value of a sensor that stepped away. */
+static monitor_verdict_t judge_stepped(sensor_monitor_t *self, const monitor_input_t *in)
+{
+    double spread;
+    const double usual = sqrt(self->r + in->variance);
+    self->since_step++;
+    if (!self->rebased && self->since_step >= REBASE) {
+        const double level = level_of(self, REBASE, &spread);
+        self->rebased = spread < NOISE_OFF * usual;
+        self->offset = level;
+    }
+    if (!self->rebased || self->distrusted_steps > REBASE_HOLD) {
+        return (monitor_verdict_t){0};
+    }
+    const double rest = in->residual - self->offset;
+    self->run = fabs(rest) > self->gate * usual ? self->run + 1 : 0;
+    if (self->run >= MONITOR_RUN) { /* it stepped again */
+        self->rebased = false;
+        self->since_step = 0;
+        self->run = 0;
+    }
+    return (monitor_verdict_t){.share = self->run > 0 ? 0.0 : REBASED_SHARE, .offset = self->offset};
+}
+
+/* A value of a sensor that is not believed: has it come back? */
+static monitor_verdict_t judge_distrusted(sensor_monitor_t *self, const monitor_input_t *in)
+{
+    const double usual = sqrt(self->r + in->variance);
+    double spread;
+    const double level = level_of(self, MONITOR_HISTORY, &spread);
+    const bool crept = self->fault == SENSOR_DRIFT || self->fault == SENSOR_SLOW;
+    const double plausible = crept ? CREEP_DEGC + CREEP_DEGC_S * STEP_S * self->distrusted_steps
+                                   : PLAUSIBLE_DEGC + 3.0 * sqrt(in->variance);
+    if (spread > NOISE_OFF * sqrt(self->r) || fabs(level) > plausible ||
+        fabs(in->residual - level) > self->gate * usual) {
+        self->since_change = 0;
+    }
+    if (self->since_change < calm_needed(self)) {
+        return self->fault == SENSOR_OFFSET ? judge_stepped(self, in) : (monitor_verdict_t){0};
+    }
+    trust(self);
+    return (monitor_verdict_t){.share = 1.0, .resume = true, .level = level};
+}
+
+monitor_verdict_t sensor_monitor_step(sensor_monitor_t *self, const monitor_input_t *in)
+{
+    self->distrusted_steps += !self->trusted;
+    const bool out_of_range = in->raw < self->range_low || in->raw > self->range_high;
+    if (!isfinite(in->y) || out_of_range) {
+        return absent(self, out_of_range);
+    }
+    self->missing = 0;
+    if (is_stuck(self, in)) {
+        const bool news = self->trusted;
+        distrust(self, SENSOR_STUCK);
+        return (monitor_verdict_t){.forget = news ? MONITOR_RUN : 0};
+    }
+    remember(self, in->residual, in->variance);
+    self->since_change++;
+    return self->trusted ? judge_trusted(self, in) : judge_distrusted(self, in);
+}
+
+double sensor_monitor_late(const sensor_monitor_t *self, double raw, double residual, double variance)
+{
+    if (!self->trusted || raw < self->range_low || raw > self->range_high ||
+        fabs(residual) > self->gate * sqrt(self->spread_r + variance)) {
+        return 0.0;
+    }
+    return self->r / self->spread_r;
+}
