@@ -16,7 +16,6 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -24,7 +23,7 @@ from plant_sim.errors import PlantError
 from rt_runner.errors import RtError
 from tools import compare_table
 from tools.compare_cases import CHANNELS, UnknownCase, chosen
-from tools.compare_run import Done, compare
+from tools.compare_run import Done, WorkerDied, compare
 from tools.estimators.registry import COMPARED, UnknownEstimator, make
 from tools.files import write_json, write_whole
 from tools.rows import DataError
@@ -49,11 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{time.monotonic() - begun:.0f} s", file=shown)
         write_json(args.json, found)
         _document(args, found, cases, names, shown)
-    except (UnknownEstimator, UnknownCase, DataError, PlantError, RtError) as error:
+    except (UnknownEstimator, UnknownCase, DataError, PlantError, RtError, WorkerDied) as error:
         print(f"compare: {error}", file=sys.stderr)
-        return 1
-    except BrokenProcessPool:
-        print("compare: a worker process was killed; --workers 1 needs the least memory", file=sys.stderr)
         return 1
     except OSError as error:
         print(f"compare: {error.filename}: {error.strerror}; choose another file", file=sys.stderr)

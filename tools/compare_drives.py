@@ -106,7 +106,8 @@ def carried(signals: Sequence[SignalInfo], name: str, values: Array) -> Array:
 
 def codes(signal: SignalInfo, values: Array) -> Array:
     """`SignalInfo.to_raw` for arrays: nearest valid code, ties away from zero; NaN stays NaN."""
-    scaled = np.clip((values - signal.offset) / signal.factor, signal.raw_min, signal.raw_max)
+    with np.errstate(over="ignore"):  # beyond the largest double is beyond the range, too
+        scaled = np.clip((values - signal.offset) / signal.factor, signal.raw_min, signal.raw_max)
     whole = np.trunc(scaled)
     rest = scaled - whole
     return whole + np.where(rest >= 0.5, 1.0, 0.0) - np.where(rest <= -0.5, 1.0, 0.0)

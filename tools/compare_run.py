@@ -6,10 +6,11 @@ import ctypes
 import multiprocessing
 import os
 import signal
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from tools.compare_cases import CHANNELS, Case, Variant
@@ -69,42 +70,101 @@ def compare(
 
 
 def _work(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, list[Figures]]]:
+    """Figures of each task, as they get finished."""
     if workers == 0:
         yield from ((task, perform(task)) for task in tasks)
         return
-    with _pool(min(workers, len(tasks))) as pool:
-        # Whoever warms an estimator up compiles its loops, once in a checkout; the others then find them on disk.
-        names = dict.fromkeys(task.estimator for task in tasks)
-        under_way: dict[Future[list[Figures]], Task | str] = {pool.submit(_warm_up, name): name for name in names}
-        while under_way:
-            for future in wait(under_way, return_when=FIRST_COMPLETED).done:
-                what, figures = under_way.pop(future), future.result()
-                if isinstance(what, Task):
-                    yield what, figures
+    # Whoever warms an estimator up compiles its loops, once in a checkout; the others then find them on disk.
+    ready: deque[Task | str] = deque(dict.fromkeys(task.estimator for task in tasks))
+    waiting = {str(name): [task for task in tasks if task.estimator == name] for name in ready}
+    busy: dict[Connection, Task | str] = {}
+    with _pool(min(workers, len(tasks))) as links:
+        idle = list(links)
+        while ready or busy:
+            while ready and idle:
+                link = idle.pop()
+                busy[link] = ready.popleft()
+                _hand_out(link, busy[link])
+            for link in wait(list(busy)):
+                assert isinstance(link, Connection)
+                what, figures = busy.pop(link), _answer(link)
+                idle.append(link)
+                if isinstance(what, str):
+                    ready.extend(waiting[what])
                 else:
-                    under_way |= {pool.submit(perform, task): task for task in tasks if task.estimator == what}
+                    yield what, figures
+
+
+class WorkerDied(Exception):
+    """A process ended in the middle of its work."""
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[list[Connection]]:
+    """Forked processes that take a task and give its figures, and end with us whatever ends us.
+
+    Pipes and no threads: an interrupt may come at any point and finds no lock held. (The executor of the standard
+    library hangs when one comes while it waits for many results.)
+    """
+    context = multiprocessing.get_context("fork")
+    processes, links = [], []
+    try:
+        for _ in range(workers):
+            ours, theirs = context.Pipe()
+            process = context.Process(target=_serve, args=(theirs,), daemon=True)
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+            try:
+                process.start()
+                processes.append(process)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            theirs.close()  # so that the end of the process is the end of the pipe
+            links.append(ours)
+        yield links
+    finally:
+        for process in processes:
+            process.kill()
+        for process in processes:
+            process.join()
+
+
+def _serve(link: Connection) -> None:
+    """A worker: tasks in, figures or the exception out."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of us: the parent ends us
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+    while True:
+        task: Task | str = link.recv()
+        try:
+            link.send(_warm_up(task) if isinstance(task, str) else perform(task))
+        except Exception as error:
+            link.send(error)
+
+
+DIED = "a worker process was killed; --workers 1 needs the least memory"
+
+
+def _hand_out(link: Connection, task: Task | str) -> None:
+    try:
+        link.send(task)
+    except BrokenPipeError:
+        raise WorkerDied(DIED) from None
+
+
+def _answer(link: Connection) -> list[Figures]:
+    try:
+        answer = link.recv()
+    except (EOFError, ConnectionResetError):
+        raise WorkerDied(DIED) from None
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
 
 
 def _warm_up(name: str) -> list[Figures]:
     run(make(name), sense(next(iter(_laps.values())), 0).cut(0, 40))
     return []
-
-
-@contextmanager
-def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Forked workers that end with us: at once when we are interrupted, by the kernel when we are killed."""
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), initializer=_in_worker)
-    try:
-        yield pool
-    finally:
-        # What has begun is finished (seconds), what has not is dropped.
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _in_worker() -> None:
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of us: the parent decides
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _cores() -> int:
