@@ -85,6 +85,7 @@ def test_every_job_is_published_and_every_release_accounted_for(bus, period_ms, 
         assert run.final["tx_drops"] == run.lost_here == 0, "so few frames must never be lost"
     assert seconds * 1000 / period_ms - 2 <= run.final["releases"] <= run.life_s * 1000 / period_ms + 1
     assert 0.5 * talk.sent_ticks < run.final["rx"]["MotorState"]["ok"] <= talk.sent_ticks
+    assert run.final["rx"]["Coolant"]["ok"] >= 2, "the kernel's filter lets it through"
     assert run.final["rx"]["MotorState"]["wrong_crc"] == run.final["rejected"] == run.final["rx_drops"] == 0
     assert run.final["rx"]["MotorState"]["in_age_us"]["min"] >= 0
     assert run.named("Estimate")[-1].values["status"] in (1, OK, 3)
