@@ -21,7 +21,7 @@ from tools.estimators.registry import make
 
 PR_SET_PDEATHSIG = 1
 Done = Callable[[int, int, str], None]  # finished runs, all runs, what was finished last
-_laps: dict[str | None, Lap] = {}  # filled before the processes are forked, so that none has to drive or receive one
+_laps: dict[str | None, Lap] = {}  # driven once a process; the first one before the fork
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,7 @@ def compare(
     variants = list(dict.fromkeys(v for case in cases for v in case.variants))
     plants = list(dict.fromkeys(v.mismatch for v in variants))
     groups = [tuple(v for v in variants if v.mismatch == plant) for plant in plants]
-    for plant in plants:
-        if plant not in _laps:
-            _laps[plant] = drive_lap(plant)
+    _lap(plants[0])
     tasks = [Task(name, seed, channel, group) for seed in range(seeds) for name in estimators for group in groups]
     tasks.sort(key=lambda t: len(t.variants), reverse=True)  # short ones last: they fill the gaps
 
@@ -167,13 +165,19 @@ def _warm_up(name: str) -> list[Figures]:
     return []
 
 
+def _lap(plant: str | None) -> Lap:
+    if plant not in _laps:
+        _laps[plant] = drive_lap(plant)
+    return _laps[plant]
+
+
 def _cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
 def perform(task: Task) -> list[Figures]:
     """Figures of a task's variants, in their order."""
-    lap = _laps[task.variants[0].mismatch]
+    lap = _lap(task.variants[0].mismatch)
     column = CHANNELS.index(task.channel)
     drives = [sense(lap, task.seed, variant.on(task.channel)) for variant in task.variants]
     found = run_each(make(task.estimator), drives)
