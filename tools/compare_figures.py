@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 SEED = 0
-POINTS = 1500  # of a line: more are not seen and make the file large
+POINTS = 800  # of a line: more are not seen and make the file large
 TRUTH, RAW = "#000000", "#b8b8b8"
 # Okabe and Ito's colours, told apart with any colour vision; dashes help where lines lie together.
 STYLES: dict[str, dict[str, Any]] = {
