@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from tools.compare_cases import CHANNELS, Case
+from tools.compare_cases import CHANNELS, Case, Target
 from tools.rows import DataError
 
 BEGIN, END = "<!-- compare:begin -->", "<!-- compare:end -->"
@@ -45,22 +45,22 @@ def markdown(found: Found, cases: Sequence[Case], seeds: int, channel: str) -> s
     if faulty:
         parts += ["In the time of the fault:", _table(
             ["case", *names],
-            [[case.title, *(_pair(found[n][case.name], "rmse_window", "max_window", True) for n in names)]
+            [[case.name, *(_pair(found[n][case.name], "rmse_window", "max_window", True) for n in names)]
              for case in faulty],
         )]  # fmt: skip
     parts += ["Where the winding is above 140 °C, RMSE in °C:", _table(
         ["case", *names],
-        [[case.title, *(_spread(found[n][case.name], "rmse_hot") for n in names)] for case in cases],
+        [[case.name, *(_spread(found[n][case.name], "rmse_hot") for n in names)] for case in cases],
     )]  # fmt: skip
     parts += [
         "Detection in s / false alarms per hour / recovery in s (– none; \\* not in every run):",
-        _table(["case", *names], [[case.title, *(_reaction(found[n][case.name]).replace("*", "\\*") for n in names)]
+        _table(["case", *names], [[case.name, *(_reaction(found[n][case.name]).replace("*", "\\*") for n in names)]
                                   for case in cases]),
     ]  # fmt: skip
     named = [n for n in names if any(found[n][case.name]["classes_in_window"] for case in faulty)]
     if named:
         parts += ["What the published class says while the fault lasts, share of time:", _table(
-            ["case", *named], [[case.title, *(_classes(found[n][case.name]) for n in named)] for case in faulty],
+            ["case", *named], [[case.name, *(_classes(found[n][case.name]) for n in named)] for case in faulty],
         )]  # fmt: skip
     verdicts = [*_targets(found, cases, channel), *_better(found, cases)]
     return "\n\n".join(parts + (["\n".join(f"- {line}" for line in verdicts)] if verdicts else []))
@@ -93,9 +93,23 @@ def inserted(path: Path, tables: str) -> str:
 def _main_row(found: Found, names: Sequence[str], case: Case, channel: str) -> list[str]:
     target = NONE
     if case.target is not None and channel == CHANNELS[0]:
-        where = ", in the window" if case.target.in_window else ""
-        target = f"≤ {case.target.rmse_degc:g} / {case.target.max_degc:g}{where}"
-    return [case.title, target, *(_pair(found[n][case.name], "rmse", "max", True) for n in names)]
+        where = " in the window" if case.target.in_window else ""
+        verdict = {True: ", met", False: ", **missed**", None: ""}[_met(found, case)]
+        target = f"≤ {case.target.rmse_degc:g} / {case.target.max_degc:g}{where}{verdict}"
+    return [f"**{case.name}**: {case.title}", target, *(_pair(found[n][case.name], "rmse", "max", True) for n in names)]
+
+
+def _judged_keys(target: Target) -> tuple[str, str]:
+    return ("rmse_window", "max_window") if target.in_window else ("rmse", "max")
+
+
+def _met(found: Found, case: Case) -> bool | None:
+    """Whether the default estimator meets a case's target; None where one of them is not there."""
+    if JUDGED not in found or case.target is None:
+        return None
+    limits = (case.target.rmse_degc, case.target.max_degc)
+    figures = [found[JUDGED][case.name][key] for key in _judged_keys(case.target)]
+    return all(f is not None and f <= limit for f, limit in zip(figures, limits, strict=True))
 
 
 def _targets(found: Found, cases: Sequence[Case], channel: str) -> list[str]:
@@ -104,16 +118,11 @@ def _targets(found: Found, cases: Sequence[Case], channel: str) -> list[str]:
         return []
     lines, asked = [], [case for case in cases if case.target is not None]
     for case in asked:
-        f, target = found[JUDGED][case.name], case.target
-        assert target is not None
-        keys = ("rmse_window", "max_window") if target.in_window else ("rmse", "max")
-        if not all(f[k] is not None and f[k] <= limit for k, limit in zip(keys, (target.rmse_degc, target.max_degc),
-                                                                           strict=True)):  # fmt: skip
-            where = " in the window" if target.in_window else ""
-            lines.append(
-                f"{JUDGED} misses the target of {case.name}: {_pair(f, *keys)}{where}, asked for "
-                f"{target.rmse_degc:g} / {target.max_degc:g}"
-            )
+        if case.target is not None and _met(found, case) is False:
+            shown = _pair(found[JUDGED][case.name], *_judged_keys(case.target))
+            where = " in the window" if case.target.in_window else ""
+            limits = f"{case.target.rmse_degc:g} / {case.target.max_degc:g}"
+            lines.append(f"{JUDGED} misses the target of {case.name}: {shown}{where}, asked for {limits}")
     return lines if lines or not asked else [f"{JUDGED} meets all {len(asked)} targets."]
 
 

@@ -180,7 +180,7 @@ def test_the_table_says_which_target_is_missed_and_who_is_better():
     bad = compare_table.markdown(found_with({"default": 0.13, "ukf": 0.12}), nominal, 1, "winding")
     assert "- default misses the target of nominal: 0.130 / 0.52, asked for 0.12 / 0.5" in bad
     assert "- nominal, RMSE: ukf 0.120 against default 0.130 °C" in bad
-    assert "| nothing wrong | ≤ 0.12 / 0.5 | 0.130 ± 0.000 / 0.52 ± 0.00 | 0.120" in bad
+    assert "| **nominal**: nothing wrong | ≤ 0.12 / 0.5, **missed** | 0.130 ± 0.000 / 0.52 ± 0.00 | 0.120" in bad
     rotor = compare_table.plain(found_with({"default": 0.13}), nominal, 1, "rotor")
     assert "target" not in rotor
 
@@ -305,7 +305,7 @@ def test_figures_and_document_are_written(tmp_path):
     done = rt_runner("compare", "--seeds", 1, "--estimators", "raw,average,lptn-kf", "--cases", "nominal,offset",
                      "--doc", doc, "--figures", tmp_path / "figures")  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "| nothing wrong | ≤ 0.12 / 0.5 |" in doc.read_text()
+    assert "| **nominal**: nothing wrong | ≤ 0.12 / 0.5 |" in doc.read_text()
     drawn = sorted(p.name for p in (tmp_path / "figures").iterdir())
     assert drawn == [f"estimator_{name}.svg" for name in ("lap", "noise", "offset", "zoom")]
     for path in (tmp_path / "figures").iterdir():
