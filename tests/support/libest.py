@@ -152,7 +152,7 @@ class Lib:
         self.c.est_setting_find.restype = ct.POINTER(Setting)
         self.c.est_setting_find.argtypes = [ct.c_char_p]
         self.c.mhe_measure.restype = f64
-        self.c.mhe_measure.argtypes = [ct.c_void_p, ct.c_int, ct.c_int, f64]
+        self.c.mhe_measure.argtypes = [ct.c_void_p, ct.c_int, ct.c_int, f64, f64]
         self.c.mhe_cost.restype = f64
         self.c.mhe_cost.argtypes = [ct.c_void_p, ct.c_void_p]
         self.c.mhe_node.restype = ct.POINTER(f64)
@@ -245,8 +245,8 @@ class Mhe:
         self.lib.c.mhe_advance(self.memory, _ptr(_f64(u)))
         self.count = min(self.count + 1, NODES)
 
-    def measure(self, age: int, channel: int, y: float) -> float:
-        return self.lib.c.mhe_measure(self.memory, age, channel, y)
+    def measure(self, age: int, channel: int, y: float, share: float = 1.0) -> float:
+        return self.lib.c.mhe_measure(self.memory, age, channel, y, share)
 
     def solve(self) -> tuple[int, MheResult]:
         result = MheResult()
