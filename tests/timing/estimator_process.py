@@ -1,10 +1,9 @@
-"""Drives the estimator binary: made-up plant frames in, records or bus frames out, statistics as JSON."""
+"""Drives the estimator binary: frames of a simulated lap in, records or bus frames out, statistics as JSON."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 import signal
 import subprocess
@@ -12,11 +11,18 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import can
+import numpy as np
 import pytest
 
+from plant_sim.cycles import CycleSpec
+from plant_sim.params import load_params
+from plant_sim.plant import Plant as SimulatedPlant
+from plant_sim.sensors import TemperatureSensor
+from plant_sim.state import ROW_SPEED, ROW_THETA_R, ROW_THETA_W, ROW_TORQUE
 from rt_runner import paths
 from rt_runner.bus import open_bus
 from rt_runner.codec import Decoder, Encoder
@@ -28,6 +34,7 @@ DBC = load_dbc()
 DBC_SHA256 = hashlib.sha256(DEFAULT_DBC.read_bytes()).hexdigest()
 MS = 1_000_000
 TICK_NS = 10 * MS
+LAP_TICKS = 72_000
 CONTENT = ("Estimate", "EstimateInnov", "EstValidity", "EstWinding", "EstRotor")  # what carries no timing
 PER_JOB = (*CONTENT, "EstTimingA", "EstTimingB")
 COUNTERS = ("EstReleases", "EstMisses", "EstInputFaults", "EstBusFaults", "EstCoreFaults", "EstCoreFaults2",
@@ -46,23 +53,45 @@ def binary(kind: str) -> Path:
     return path
 
 
+@cache
+def lap() -> tuple[np.ndarray, np.ndarray]:
+    """The lap from 60 degC on: one row per tick (from 1 on), and the sensors' readings at every tenth.
+
+    The sensor monitor tells real temperatures from made-up ones, so the temperatures follow from torque and speed.
+    """
+    params = load_params()
+    rows = SimulatedPlant(params, CycleSpec("lap", theta0_degc=60.0)).record(LAP_TICKS, stop=False)
+    sensor = TemperatureSensor(params.sensor, np.array([60.0, 60.0]), np.random.default_rng(1))
+    return rows, sensor.sample(rows[9::10, ROW_THETA_W : ROW_THETA_R + 1])
+
+
 class Plant:
-    """Plausible MotorState and TempMeas frames, tick after tick."""
+    """MotorState, TempMeas and Coolant frames of the lap, tick after tick; beyond its end its last ones."""
 
     def __init__(self) -> None:
         self._encoder = Encoder(DBC, "PLANT")
+        self._rows, self._readings = lap()
+
+    def truth(self, tick: int) -> tuple[float, float]:
+        """True winding and rotor temperature, degC."""
+        theta_w, theta_r = self._row(tick)[ROW_THETA_W : ROW_THETA_R + 1]
+        return float(theta_w), float(theta_r)
+
+    def _row(self, tick: int) -> np.ndarray:
+        return self._rows[min(max(tick - 1, 0), len(self._rows) - 1)]
 
     def motor(self, tick: int, **override) -> bytes:
         values = {
             "derating_active": 0,
-            "torque_nm": 60 + 40 * math.sin(tick / 300),
-            "speed_rpm": 6000 + 3000 * math.sin(tick / 500),
+            "torque_nm": self._row(tick)[ROW_TORQUE],
+            "speed_rpm": self._row(tick)[ROW_SPEED],
             "tick": tick % 65536,
         }
         return bytes(self._encoder.encode("MotorState", values | override).data)
 
     def temp(self, tick: int, **override) -> bytes:
-        values = {"theta_w_meas_degc": 79.0 + tick * 1e-3, "theta_r_meas_degc": 69.0, "tick": tick % 65536}
+        theta_w, theta_r = self._readings[min(max(tick // 10 - 1, 0), len(self._readings) - 1)]
+        values = {"theta_w_meas_degc": theta_w, "theta_r_meas_degc": theta_r, "tick": tick % 65536}
         return bytes(self._encoder.encode("TempMeas", values | override).data)
 
     def coolant(self, tick: int, **override) -> bytes:

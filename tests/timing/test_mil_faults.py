@@ -64,6 +64,34 @@ def test_an_offset_of_the_command_line_is_in_the_measurement_and_in_the_truth(tm
     assert "recomputed from the frames: the same result" in inspected.stdout
 
 
+def test_the_estimator_notices_says_so_and_stays_right(tmp_path):
+    path = scenario(tmp_path, "offset:-20@430-440", duration=30.0, start=415.0)
+    reader, result = mil(tmp_path, "seen", path)
+    s = result["sensors"]["theta_w"]
+    assert (s["true_faults"], s["fault_start_s"]) == (["offset"], 430.0)
+    assert s["detection_s"] <= 2.0
+    assert 0.2 < s["class_share"]["offset"] < 0.7
+    assert s["fault_max_error_degc"] <= 1.0
+    assert result["sensors"]["theta_r"]["class_share"] == {"ok": 1.0}
+    estimates, uppers = by_tick(reader, "Estimate"), by_tick(reader, "EstWinding")
+    assert {v["sensor_w_trusted"] for t, v in uppers.items() if 43050 <= t < 43150} == {0.0}
+    assert {v["sensor_w_trusted"] for t, v in uppers.items() if 42600 <= t < 43000} == {1.0}
+    assert all(uppers[t]["upper_w_degc"] > estimates[t]["theta_w_est_degc"] for t in estimates if t > 42600)
+    assert all(0 < v["sigma_w_degc"] < 2 for t, v in uppers.items() if t > 42600)
+
+
+def test_key_on_finds_the_offset_that_the_datasheet_does_not_know(tmp_path):
+    reader, result = mil(tmp_path, "key", "key-on", "--duration", 30)
+    found = result["sensors"]["calibration"]
+    assert found["state"] == "frozen"
+    for c in "wr":
+        assert found[f"offset_{c}_degc"] == pytest.approx(-1.5, abs=0.15)
+        assert 0.005 < found[f"offset_sigma_{c}_degc"] < 0.2
+    states = [int(f.values["calibration_state"]) for f in reader.frames() if f.name == "EstCalibration"]
+    assert states == sorted(states), "measured once, then frozen"
+    assert {1, 2} <= set(states)
+
+
 def test_every_kind_of_a_scenario_file_is_on_the_bus_bit_by_bit(tmp_path):
     faults = ["offset:-20@426-427", "noise:5@427-428/r", "stuck@428-429", "dropout:nan@429-430/wr", "spike:50%@430-431",
               "drift:-1@431-432", "slow:5@432-433/r", "delay:2@433-434", "gain:-5%@434-435"]  # fmt: skip

@@ -1,11 +1,15 @@
 """The DBC: it says what the project agreed on, and a broken one is refused with one clear line."""
 
 import hashlib
+import tomllib
+from pathlib import Path
 
 import cantools
 import pytest
 
 from rt_runner.dbc import DEFAULT_DBC, DbcError, load_dbc, parse_dbc
+
+SETTINGS = Path(__file__).resolve().parents[2] / "estimator_c" / "settings"
 
 # name: id, sender, cycle ms, {signal: (start, length, signed, factor, offset, has not_available)}
 U16, S16 = (16, False), (16, True)
@@ -119,6 +123,12 @@ def test_cantools_loads_it_strictly_and_shows_labels():
     assert labels("EstWinding", "sensor_w_fault") == labels("EstRotor", "sensor_r_fault") == classes
     states = dict(enumerate(("datasheet", "measuring", "frozen", "refused")))
     assert labels("EstCalibration", "calibration_state") == states
+
+
+def test_every_setting_of_the_estimator_has_its_label():
+    labels = next(s.labels for s in load_dbc()["EstBuild"].signals if s.name == "setting_id")
+    settings = {tomllib.loads(p.read_text())["id"]: p.stem for p in SETTINGS.glob("*.toml")}
+    assert {code: label for code, label in labels.items() if label != "not_available"} == settings
 
 
 def test_not_available_is_all_ones_or_most_negative_and_never_a_valid_code():
