@@ -363,6 +363,7 @@ static void consume_interval(estimator_t *self, estimator_out_t *out)
     out->intervals++;
     if (self->started) {
         validity_step(&self->validity, self->input[slot(k)], self->theta); /* as the net is fed for interval k */
+        self->novelty[slot(k)] = self->validity.result.novelty;
     }
 
     const int64_t node = k + 1 - self->setting.delay_steps;
@@ -376,6 +377,7 @@ static void consume_interval(estimator_t *self, estimator_out_t *out)
         }
     } else {
         fusion_advance(&self->fusion, self->input[slot(node - 1)]);
+        fusion_doubt(&self->fusion, self->novelty[slot(node - 1)]);
     }
     measure_newest(self, node);
     solve(self, k + 1, out);

@@ -99,6 +99,7 @@ typedef struct {
     /* Interval memory, index k modulo ring. */
     estimator_bin_t bin[ESTIMATOR_RING];
     double input[ESTIMATOR_RING][2];   /* [speed rpm, torque Nm] of consumed intervals */
+    double novelty[ESTIMATOR_RING];    /* of consumed intervals, see validity.h */
     double measured[ESTIMATOR_RING][MHE_CHANNELS]; /* by node, offset removed; NAN: none */
     double held_input[2];              /* of the newest interval that had frames */
 

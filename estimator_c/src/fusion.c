@@ -6,6 +6,8 @@
 static const double START_VARIANCE = 10.0;    /* K^2, where the prior says next to nothing */
 static const double CREEP_VARIANCE = 0.25;    /* K^2, of the slow observer's level */
 static const double USABLE_KKT_DEGC = 0.01;   /* an MHE cut short is still used below this */
+static const double DOUBT = 1.0;              /* K^2 per step, one half-width outside the envelope */
+static const double NOVELTY_MAX = 10.0;
 static const int32_t MEMORY_STEPS = 200;      /* 20 s: until then the filter still learns what the net should remember */
 
 void fusion_init(fusion_t *self, const est_setting_t *setting)
@@ -70,6 +72,17 @@ void fusion_advance(fusion_t *self, const double u[2])
     ekf_predict(&self->ekf, u);
     hand_over(self);
     slow_observer_predict(&self->slow, u);
+}
+
+void fusion_doubt(fusion_t *self, double novelty)
+{
+    if (!(novelty > 1.0)) { /* NAN where the weights carry no envelope */
+        return;
+    }
+    const double beyond = fmin(novelty, NOVELTY_MAX) - 1.0;
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        self->ekf.p[ch][ch] += DOUBT * beyond * beyond;
+    }
 }
 
 static double prediction(const fusion_t *self, int channel)

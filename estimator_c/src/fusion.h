@@ -57,6 +57,10 @@ void fusion_start(fusion_t *self, const double prior[MHE_CHANNELS], const double
 /* One step of the net with u = [speed rpm, torque Nm]. Never fails. */
 void fusion_advance(fusion_t *self, const double u[2]);
 
+/* The last step was outside what the net knows, `novelty` half-widths from the middle (see validity.h): the prediction is
+ * worth less, so that it does not condemn a sound sensor. Up to 1: nothing happens. */
+void fusion_doubt(fusion_t *self, double novelty);
+
 /* The value of a channel for the newest node, offset removed (NAN: none), and as the sensor gave it. Once per step and
  * channel. Returns the innovation (NAN: none) and its predicted variance. */
 double fusion_measure(fusion_t *self, int channel, double y, double raw, double *variance);

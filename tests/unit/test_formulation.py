@@ -132,9 +132,11 @@ SETTING_FAULTS = {
     "missing": ("delay_steps = 15", "", "sensor.delay_steps"),
     "type": ("delay_steps = 15", "delay_steps = 1.5", "sensor.delay_steps"),
     "range": ("delay_steps = 15", "delay_steps = 500", "sensor.delay_steps"),
-    "not a pair": ("noise = [2.0e3, 4.0e4]", "noise = 3.0", "weights.noise"),
-    "infinite": ("noise = [2.0e3, 4.0e4]", "noise = [1.0, inf]", "weights.noise"),
+    "not a pair": ("noise = [4.0e3, 4.0e4]", "noise = 3.0", "weights.noise"),
+    "infinite": ("noise = [4.0e3, 4.0e4]", "noise = [1.0, inf]", "weights.noise"),
     "flag": ("hard = false", 'hard = "no"', "bounds.hard"),
+    "choice": ('loss = "geman-mcclure"', 'loss = "cauchy"', "robust.loss"),
+    "sensor range": ("range_low_degc = -38.0", "range_low_degc = 500.0", "sensor"),
     "bounds": ("upper_degc = 200.0", "upper_degc = -100.0", "bounds"),
     "id": ("id = 0", "id = 1", "id"),
     "syntax": ("id = 0", "id = ", "file"),
@@ -159,7 +161,7 @@ def test_every_setting_reaches_c_unchanged() -> None:
     lib = Lib(compile_library(WEIGHTS))
     assert [field.c_name for field in FIELDS] == [name for name, *_ in Setting._fields_[2:]]
     settings = load_settings(SETTINGS)
-    assert [(s.id, s.name) for s in settings] == [(0, "default"), (1, "paper")]
+    assert [(s.id, s.name) for s in settings] == [(0, "default"), (1, "paper"), (2, "ekf")]
     for setting in settings:
         in_c = lib.setting(setting.name)
         assert (in_c.id, in_c.name.decode()) == (setting.id, setting.name)
