@@ -175,6 +175,29 @@ def test_the_loss_map_is_the_machines():
     assert heat[2, :2] == pytest.approx([0.0, 0.0], abs=1.0)
 
 
+def test_the_network_filter_is_the_kalman_filter_of_the_textbook():
+    """Against matrices, H and a joint update of both channels; starts at the coolant's and the winding's mean."""
+    drive, _ = drive_of(50)
+    tuned, r = load_tuned(), np.diag([0.1, 0.2])
+    found = run(LptnKf("kf", tuned.network, tuned.lptn_q_k2, (0.1, 0.2), INF), drive).theta_degc
+    heat, y = lptn.heats(drive.u), drive.y + 1.0
+    h = np.array([[1.0, 0, 0, 0], [0, 0, 0, 1.0]])
+    w, rotor = y[:DELAY_STEPS].mean(axis=0)
+    theta, cov = np.array([w, (w + 65.0) / 2, (w + 65.0) / 2, rotor]), np.diag([10.0, 400.0, 400.0, 10.0])
+    slope = np.empty((4, 4))
+    for row in range(DELAY_STEPS, 50):
+        node = row - DELAY_STEPS
+        if node > 0:
+            lptn.step(tuned.network, drive.u[node, 0], heat[node], theta, slope)
+            cov = slope @ cov @ slope.T + np.diag(tuned.lptn_q_k2)
+        gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + r)
+        theta, cov = theta + gain @ (y[row] - h @ theta), (np.eye(4) - gain @ h) @ cov
+        now = theta.copy()
+        for k in range(node + 1, row + 1):
+            lptn.step(tuned.network, drive.u[k, 0], heat[k], now, slope)
+        np.testing.assert_allclose(found[row], now[[0, 3]], atol=1e-9)
+
+
 # ---- the plain ones -------------------------------------------------------------------------------------------------
 @given(st.lists(st.one_of(st.floats(-50, 200), st.just(math.nan)), min_size=1, max_size=60))
 @settings(max_examples=60, deadline=None)
