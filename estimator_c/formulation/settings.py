@@ -35,6 +35,7 @@ FIELDS = (
     Field("estimator", "kind", "kind", "choice", 0, 1, "whose estimate is published", ESTIMATORS),
     Field("sensor", "delay_steps", "delay_steps", "int", 0, 50, "sensor delay in intervals of 0.1 s"),
     Field("sensor", "offset_degc", "offset_degc", "float", -50, 50, "known sensor offset, subtracted"),
+    Field("sensor", "offset_sigma_degc", "offset_sigma_degc", "float", 0, 50, "its standard deviation"),
     Field(
         "sensor",
         "timeout_s",

@@ -68,7 +68,8 @@ estimator_error_t estimator_init(estimator_t *self, const est_setting_t *setting
         return ESTIMATOR_BAD_SETTING;
     }
     self->setting = *setting;
-    offset_calibration_init(&self->calibration, setting->offset_degc, setting->delay_steps, setting->key_on_calibration);
+    offset_calibration_init(&self->calibration, setting->offset_degc, setting->offset_sigma_degc, setting->delay_steps,
+                            setting->key_on_calibration);
     forget(self);
     return ESTIMATOR_OK;
 }
@@ -417,13 +418,14 @@ static estimator_channel_t channel_now(const estimator_t *self, int ch, double t
 {
     const sensor_monitor_t *monitor = &self->fusion.monitor[ch];
     const double sigma = sqrt(self->variance[ch]);
+    const double offset_sigma = self->calibration.result.sigma_degc[ch];
     const double beyond_s = fmax(0.0, distrusted_s(monitor) - self->setting.open_loop_s);
     const double margin = fmin(MARGIN_MAX_DEGC, MARGIN_DEGC_S * beyond_s);
     return (estimator_channel_t){
         .fault = monitor->fault,
         .trusted = self->fusion.share[ch] > 0.0,
         .sigma_degc = sigma,
-        .upper_degc = theta_degc + UPPER_SIGMA * sqrt(self->variance[ch] + MODEL_VARIANCE) + margin,
+        .upper_degc = theta_degc + UPPER_SIGMA * sqrt(self->variance[ch] + MODEL_VARIANCE + offset_sigma * offset_sigma) + margin,
         .innov_sigma_degc = isnan(self->innovation[ch]) ? NAN : sqrt(self->innovation_variance[ch]),
     };
 }

@@ -7,6 +7,8 @@ static const double START_VARIANCE = 10.0;    /* K^2, where the prior says next 
 static const double CREEP_VARIANCE = 0.25;    /* K^2, of the slow observer's level */
 static const double USABLE_KKT_DEGC = 0.01;   /* an MHE cut short is still used below this */
 static const double DOUBT = 1.0;              /* K^2 per step, one half-width outside the envelope */
+static const double LACK_S = 3.0;
+static const double LACK_USUAL = 0.03;         /* degC/s */
 static const double NOVELTY_MAX = 10.0;
 static const int32_t MEMORY_STEPS = 200;      /* 20 s: until then the filter still learns what the net should remember */
 
@@ -33,6 +35,18 @@ void fusion_start(fusion_t *self, const double prior[MHE_CHANNELS], const double
 static bool uses_mhe(const fusion_t *self)
 {
     return self->setting.kind == EST_KIND_MHE;
+}
+
+/* A rate that is wrong by m for a time tau moves the temperature as noise of variance 2 tau m^2 dt per step would. What the
+ * slow observer has learned to be wrong is taken for m as far as it is more than any net's ordinary error. */
+static void set_noise(fusion_t *self)
+{
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        const double m = fmax(0.0, fabs(self->slow.bias[ch]) - LACK_USUAL);
+        const double q = 1.0 / self->setting.weight_noise[ch] + 2.0 * LACK_S * NET_DT_S * m * m;
+        self->ekf.q[ch] = q;
+        self->mhe.weight_noise[ch] = 1.0 / q;
+    }
 }
 
 /* Arrival cost: the filter's prediction of the oldest node says what all measurements before the window say. With it the MHE
@@ -66,6 +80,7 @@ static void hand_over(fusion_t *self)
 
 void fusion_advance(fusion_t *self, const double u[2])
 {
+    set_noise(self);
     if (uses_mhe(self)) {
         mhe_advance(&self->mhe, u);
     }
@@ -145,7 +160,9 @@ double fusion_measure(fusion_t *self, int channel, double y, double raw, double 
         (void)mhe_measure(&self->mhe, 0, channel, y, share);
     }
     ekf_update(&self->ekf, channel, y, share);
-    slow_observer_follow(&self->slow, channel, share);
+    if (share > 0.0 && (self->monitor[channel].trusted || !self->setting.supervise)) {
+        slow_observer_follow(&self->slow, channel); /* a noisy sensor with full pull: a minute averages */
+    }
     return innovation;
 }
 

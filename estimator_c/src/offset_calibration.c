@@ -8,7 +8,8 @@ static const double BELIEVABLE_DEGC = 5.0;    /* further from the datasheet the 
 static const double SPREAD_MAX_DEGC = 1.0;    /* standard deviation: noisier, nothing can be said */
 static const double ISOTHERMAL_DEGC = 0.05;   /* what soaked may still mean: part of the uncertainty */
 
-void offset_calibration_init(offset_calibration_t *self, double datasheet_degc, int32_t delay_steps, bool enabled)
+void offset_calibration_init(offset_calibration_t *self, double datasheet_degc, double sigma_degc, int32_t delay_steps,
+                             bool enabled)
 {
     memset(self, 0, sizeof *self);
     self->enabled = enabled;
@@ -17,7 +18,7 @@ void offset_calibration_init(offset_calibration_t *self, double datasheet_degc, 
     self->wait = delay_steps;
     for (int ch = 0; ch < CALIBRATION_CHANNELS; ch++) {
         self->result.offset_degc[ch] = datasheet_degc;
-        self->result.sigma_degc[ch] = NAN;
+        self->result.sigma_degc[ch] = sigma_degc;
     }
 }
 

@@ -22,7 +22,7 @@ typedef enum {
 typedef struct {
     calibration_state_t state;
     double offset_degc[CALIBRATION_CHANNELS];
-    double sigma_degc[CALIBRATION_CHANNELS]; /* NAN: nobody has measured it */
+    double sigma_degc[CALIBRATION_CHANNELS]; /* its standard deviation */
 } estimator_calibration_t;
 
 typedef struct {
@@ -34,8 +34,10 @@ typedef struct {
     estimator_calibration_t result;
 } offset_calibration_t;
 
-/* Start with the datasheet's offset; enabled = false keeps it for good. Sensors report `delay_steps` values late. */
-void offset_calibration_init(offset_calibration_t *self, double datasheet_degc, int32_t delay_steps, bool enabled);
+/* Start with the datasheet's offset and its uncertainty; enabled = false keeps them for good. Sensors report `delay_steps`
+ * values late. */
+void offset_calibration_init(offset_calibration_t *self, double datasheet_degc, double sigma_degc, int32_t delay_steps,
+                             bool enabled);
 
 /* Coolant temperature, and whether the machine has soaked and stands still. The end of the soak before ten seconds of
  * values ends the calibration without a result. */

@@ -7,7 +7,7 @@ static const int32_t REBASE = 20;            /* values that give the size of a s
 static const double REBASED_SHARE = 0.005;    /* of a value's weight afterwards: followed over ten seconds */
 static const int32_t REBASE_HOLD = 1200;     /* steps, 2 min: later the net alone knows better than a step measured then */
 static const double STEP_S = 0.1;
-static const int32_t MISSING_LIMIT = 3;      /* values in a row: one or two may be late on the bus */
+static const int32_t MISSING_LIMIT = 3;      /* values in a row: one or two may be late on the bus, or spikes */
 static const int32_t SPIKE_HOLD = 10;        /* 1 s */
 static const double EQUAL_USUAL = 0.1;       /* a sensor that repeats itself this often has no noise to go by */
 static const double STUCK_MOVE_DEGC = 1.0;   /* then: how far the prediction must have moved meanwhile */
@@ -149,12 +149,12 @@ static bool is_drift(sensor_monitor_t *self, const monitor_input_t *in)
 }
 
 /* No value, or none that can be. */
-static monitor_verdict_t absent(sensor_monitor_t *self, bool out_of_range)
+static monitor_verdict_t absent(sensor_monitor_t *self)
 {
     self->missing++;
     self->equal = 0;
     self->last_y = NAN;
-    if (out_of_range || self->missing >= MISSING_LIMIT) {
+    if (self->missing >= MISSING_LIMIT) {
         distrust(self, SENSOR_DROPOUT);
     }
     return (monitor_verdict_t){0};
@@ -196,7 +196,7 @@ static monitor_verdict_t judge_trusted(sensor_monitor_t *self, const monitor_inp
         }
     }
     const double sigma = sqrt(self->spread_r + in->variance);
-    const double share = self->r / self->spread_r;
+    const double share = self->fault == SENSOR_NOISE ? self->r / self->spread_r : 1.0;
     if (self->fault == SENSOR_NOISE && self->count >= 10 && fabs(level) > 1.3 * spread && fabs(level) > 4.0 * usual) {
         distrust(self, SENSOR_OFFSET);
         return (monitor_verdict_t){.forget = 10};
@@ -297,7 +297,7 @@ monitor_verdict_t sensor_monitor_step(sensor_monitor_t *self, const monitor_inpu
     self->distrusted_steps += !self->trusted;
     const bool out_of_range = in->raw < self->range_low || in->raw > self->range_high;
     if (!isfinite(in->y) || out_of_range) {
-        return absent(self, out_of_range);
+        return absent(self);
     }
     self->missing = 0;
     if (is_stuck(self, in)) {

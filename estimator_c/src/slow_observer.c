@@ -8,6 +8,7 @@ static const double T_MAX_S = 50.0;
 static const double GROWTH = 0.15;       /* of T with the record */
 static const double INTEGRAL_RATIO = 1.0; /* Ti = T: damping 0.5 */
 static const double BIAS_MAX = 0.1;       /* degC/s: more is no bias of a rate but a broken model */
+static const double STEP_MAX_DEGC = 1.5;
 static const double LOW_PASS = 0.05;      /* per step: 2 s */
 
 static double time_constant(const slow_observer_t *self, int channel)
@@ -36,21 +37,20 @@ void slow_observer_predict(slow_observer_t *self, const double u[2])
 void slow_observer_measure(slow_observer_t *self, int channel, double y)
 {
     if (isfinite(y)) {
-        self->raw[channel] = y - self->theta[channel];
-        self->innovation[channel] += LOW_PASS * (self->raw[channel] - self->innovation[channel]);
+        const double beside = y - self->theta[channel] - self->innovation[channel];
+        const double bounded = fmin(STEP_MAX_DEGC, fmax(-STEP_MAX_DEGC, beside)); /* a spike creeps nowhere */
+        self->raw[channel] = self->innovation[channel] + bounded;
+        self->innovation[channel] += LOW_PASS * bounded;
     }
 }
 
-void slow_observer_follow(slow_observer_t *self, int channel, double share)
+void slow_observer_follow(slow_observer_t *self, int channel)
 {
-    if (share <= 0.0) {
-        return;
-    }
     const double e = self->raw[channel];
     const double t = time_constant(self, channel);
     self->age_s[channel] += NET_DT_S;
-    self->theta[channel] += share * NET_DT_S * e / t;
-    const double bias = self->bias[channel] + share * NET_DT_S * e / (t * t * INTEGRAL_RATIO);
+    self->theta[channel] += NET_DT_S * e / t;
+    const double bias = self->bias[channel] + NET_DT_S * e / (t * t * INTEGRAL_RATIO);
     self->bias[channel] = fmin(BIAS_MAX, fmax(-BIAS_MAX, bias));
 }
 

@@ -34,8 +34,8 @@ void slow_observer_predict(slow_observer_t *self, const double u[2]);
 /* Compare with measurement y (offset removed): the innovation. Not finite: nothing happens. */
 void slow_observer_measure(slow_observer_t *self, int channel, double y);
 
-/* Follow the last innovation with `share` (0..1) of the pull. */
-void slow_observer_follow(slow_observer_t *self, int channel, double share);
+/* Follow the last innovation. */
+void slow_observer_follow(slow_observer_t *self, int channel);
 
 /* The sensor is believed again, `shift` above this observer: go there, keeping the bias. Never fails. */
 void slow_observer_shift(slow_observer_t *self, int channel, double shift);

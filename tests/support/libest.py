@@ -32,7 +32,7 @@ class Setting(ct.Structure):
 
     _fields_ = (
         ("name", ct.c_char_p), ("id", ct.c_int32), ("kind", ct.c_int32),
-        ("delay_steps", ct.c_int32), ("offset_degc", f64), ("sensor_timeout_s", f64),
+        ("delay_steps", ct.c_int32), ("offset_degc", f64), ("offset_sigma_degc", f64), ("sensor_timeout_s", f64),
         ("range_low_degc", f64), ("range_high_degc", f64), ("key_on_calibration", ct.c_bool),
         ("loss", ct.c_int32), ("loss_scale_degc", f64), ("supervise", ct.c_bool), ("gate_sigma", f64),
         ("drift_degc", pair), ("open_loop_s", f64),
