@@ -41,7 +41,7 @@ static bool uses_mhe(const fusion_t *self)
  * slow observer has learned to be wrong is taken for m as far as it is more than any net's ordinary error. */
 static void set_noise(fusion_t *self)
 {
-    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+    for (int ch = 0; ch < MHE_CHANNELS && self->setting.supervise; ch++) {
         const double m = fmax(0.0, fabs(self->slow.bias[ch]) - LACK_USUAL);
         const double q = 1.0 / self->setting.weight_noise[ch] + 2.0 * LACK_S * NET_DT_S * m * m;
         self->ekf.q[ch] = q;
