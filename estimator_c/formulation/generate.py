@@ -161,7 +161,8 @@ def _c_list(values: Iterable[float]) -> str:
 
 
 C_TYPES = {
-    "int": "int32_t {0};", "float": "double {0};", "bool": "bool {0};", "pair": "double {0}[2];", "choice": "int32_t {0};",
+    "int": "int32_t {0};", "choice": "int32_t {0};", "float": "double {0};", "bool": "bool {0};",
+    "pair": "double {0}[2];",
 }  # fmt: skip
 
 

@@ -46,6 +46,6 @@ def test_core_calls_nothing_that_allocates_prints_or_reads_a_clock(tmp_path: Pat
         subprocess.run([*compile_command(generated), *strict, "-c", str(BASE / source), "-o", str(target)], check=True)
         listed = subprocess.run(["nm", "-u", str(target)], capture_output=True, text=True, check=True).stdout
         called = {name for name in listed.split() if name != "U"}
-        own = ("net_", "train_envelope", "mhe_", "tridiag_", "box_qp_", "validity_", "ekf_", "fusion_", "sensor_monitor_",
-               "slow_observer_", "offset_calibration_", "estimator_")
+        own = ("net_", "train_envelope", "mhe_", "tridiag_", "box_qp_", "validity_", "ekf_", "fusion_",
+               "sensor_monitor_", "slow_observer_", "offset_calibration_", "estimator_")
         assert {name for name in called if not name.startswith(own)} <= allowed, source
