@@ -12,6 +12,8 @@
 
 static const double UPPER_SIGMA = 3.0;
 static const double MODEL_VARIANCE = 0.01; /* K^2: a plant that is not quite the one the net knows, see docs/estimator.md */
+static const double START_VARIANCE = 0.09; /* the same while the net's memory is still filling */
+static const int32_t START_STEPS = 200;
 static const double MARGIN_DEGC_S = 0.05; /* of the upper bound, after too long without a trusted sensor */
 static const double MARGIN_MAX_DEGC = 10.0;
 
@@ -178,6 +180,20 @@ static void place_measurement(estimator_t *self, int64_t k, int channel, double 
     self->measured[slot(k)][channel] = y;
 }
 
+/* The offset has changed, at a standstill: the window opens anew with the next measurement, nothing from before counts. */
+static void reopen(estimator_t *self)
+{
+    fusion_init(&self->fusion, &self->setting);
+    memset(self->early_sum, 0, sizeof self->early_sum);
+    memset(self->early_count, 0, sizeof self->early_count);
+    for (int k = 0; k < ESTIMATOR_RING; k++) {
+        self->measured[k][0] = NAN;
+        self->measured[k][1] = NAN;
+    }
+    self->measurement_pending = false;
+    self->started = false;
+}
+
 void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc, double theta_r_degc, bool w_valid,
                          bool r_valid)
 {
@@ -217,7 +233,7 @@ void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc
     self->newest_temp_tick = tick;
     const double raw[MHE_CHANNELS] = {valid[0] ? theta_w_degc : NAN, valid[1] ? theta_r_degc : NAN};
     if (offset_calibration_measure(&self->calibration, raw)) {
-        self->started = false; /* at a standstill: the window opens anew with the right offset, at once */
+        reopen(self);
         return;
     }
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
@@ -419,13 +435,14 @@ static estimator_channel_t channel_now(const estimator_t *self, int ch, double t
     const sensor_monitor_t *monitor = &self->fusion.monitor[ch];
     const double sigma = sqrt(self->variance[ch]);
     const double offset_sigma = self->calibration.result.sigma_degc[ch];
+    const double model = self->fusion.steps < START_STEPS ? START_VARIANCE : MODEL_VARIANCE;
     const double beyond_s = fmax(0.0, distrusted_s(monitor) - self->setting.open_loop_s);
     const double margin = fmin(MARGIN_MAX_DEGC, MARGIN_DEGC_S * beyond_s);
     return (estimator_channel_t){
         .fault = monitor->fault,
         .trusted = self->fusion.share[ch] > 0.0,
         .sigma_degc = sigma,
-        .upper_degc = theta_degc + UPPER_SIGMA * sqrt(self->variance[ch] + MODEL_VARIANCE + offset_sigma * offset_sigma) + margin,
+        .upper_degc = theta_degc + UPPER_SIGMA * sqrt(self->variance[ch] + model + offset_sigma * offset_sigma) + margin,
         .innov_sigma_degc = isnan(self->innovation[ch]) ? NAN : sqrt(self->innovation_variance[ch]),
     };
 }
