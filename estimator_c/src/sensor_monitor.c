@@ -12,6 +12,7 @@ static const int32_t SPIKE_HOLD = 10;        /* 1 s */
 static const double EQUAL_USUAL = 0.1;       /* a sensor that repeats itself this often has no noise to go by */
 static const double STUCK_MOVE_DEGC = 1.0;   /* then: how far the prediction must have moved meanwhile */
 static const double NOISE_ON = 3.0;          /* spread over what it should be */
+static const double NOISE_WORTH = 2.0;       /* the net errs more slowly than the noise it is modelled by: measured */
 static const double NOISE_OFF = 1.6;
 static const double SLOW_MEMORY = 1.0 / 150.0; /* 15 s */
 static const double SLOW_LAG_S = 1.5;        /* slope of the slow innovation over the rate */
@@ -196,7 +197,7 @@ static monitor_verdict_t judge_trusted(sensor_monitor_t *self, const monitor_inp
         }
     }
     const double sigma = sqrt(self->spread_r + in->variance);
-    const double share = self->fault == SENSOR_NOISE ? self->r / self->spread_r : 1.0;
+    const double share = self->fault == SENSOR_NOISE ? fmin(1.0, NOISE_WORTH * self->r / self->spread_r) : 1.0;
     if (self->fault == SENSOR_NOISE && self->count >= 10 && fabs(level) > 1.3 * spread && fabs(level) > 4.0 * usual) {
         distrust(self, SENSOR_OFFSET);
         return (monitor_verdict_t){.forget = 10};
