@@ -20,15 +20,15 @@ UNARY = {
 }
 
 
-def c_signature(function: ca.Function) -> str:
-    """Prototype without the semicolon; vectors are arrays with their length."""
+def c_signature(function: ca.Function, name: str) -> str:
+    """Prototype of `function` under that name, without the semicolon; vectors are arrays with their length."""
     inputs = [f"const real_t {function.name_in(k)}[{function.numel_in(k)}]" for k in range(function.n_in())]
     outputs = [f"real_t {function.name_out(k)}[{function.numel_out(k)}]" for k in range(function.n_out())]
-    return f"void {function.name()}({', '.join(inputs + outputs)})"
+    return f"void {name}({', '.join(inputs + outputs)})"
 
 
 def c_function(function: ca.Function, real: Real = DOUBLE) -> str:
-    """Body of `function` in C, on real_t of real.h, its constants written for that type.
+    """`function` as a static C function of its name without "net_", on real_t of real.h, its constants of that type.
 
     All inputs are read before the first output is written, so an output may share memory with an input.
 
@@ -78,5 +78,5 @@ def c_function(function: ca.Function, real: Real = DOUBLE) -> str:
                 raise NotImplementedError(f"{function.name()}: CasADi operation {op} has no C form here")
             body.append(f"    const real_t t{k} = {text};")
             value[outs[0]] = f"t{k}"
-    return "\n".join([c_signature(function), "{", *reads, *body, *writes, "}", ""])
+    return "\n".join(["static " + c_signature(function, function.name().removeprefix("net_")), "{", *reads, *body, *writes, "}", ""])
 
