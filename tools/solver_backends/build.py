@@ -7,8 +7,10 @@ from pathlib import Path
 
 import casadi as ca
 
+from estimator_c.formulation.generate import generate
+from estimator_c.formulation.real import DOUBLE, Real
 from estimator_c.formulation.weights import load_weights
-from tests.support.libest import compile_library
+from tests.support.libest import ROOT, SETTINGS
 from tools.solver_backends.model import write_model
 
 HERE = Path(__file__).resolve().parent
@@ -27,9 +29,17 @@ def build_runner(folder: Path) -> Path:
     return program
 
 
-def build_mhe(weights: Path, flags: tuple[str, ...] = ("-O2",)) -> Path:
-    """The estimator's own MHE, compiled as the product is."""
-    return compile_library(weights, (*flags, f"-I{HERE}", str(HERE / "mhe_backend.c")))
+def build_mhe(weights: Path, folder: Path, real: Real = DOUBLE) -> Path:
+    """The estimator's own MHE, compiled as the product is (-O2), with every kernel there is for this type."""
+    generated, base = folder / f"gen_{real.c_type}", ROOT / "estimator_c" / "src"
+    library = folder / f"libmhe_{real.c_type}.so"
+    sources = [p for p in generate(weights, SETTINGS, generated, real) if p.suffix == ".c" and "envelope" not in p.name]
+    sources += [*sorted(base.glob("mhe*.c")), *sorted((base / "solver").glob("*.c")), HERE / "mhe_backend.c"]
+    _gcc([
+        "-O2", "-g", "-fPIC", "-shared", "-fno-math-errno", "-Wall", "-Wextra", "-Werror", f"-I{base}", f"-I{base / 'solver'}",
+        f"-I{generated}", f"-I{HERE}", *map(str, sources), "-o", str(library), "-lm",
+    ])  # fmt: skip
+    return library
 
 
 def build_hpipm(weights: Path, folder: Path) -> Path:
@@ -44,7 +54,8 @@ def build_hpipm(weights: Path, folder: Path) -> Path:
     for needed in ("libhpipm.so", "libblasfeo.so", "include/hpipm_d_ocp_qp_ipm.h"):
         if not (wheel / needed).exists():
             raise BuildError(f"the casadi wheel has no {needed}: install a casadi wheel of 3.6.7 or later from PyPI")
-    library, generated = folder / "libhpipm_backend.so", compile_library(weights).parent
+    library, generated = folder / "libhpipm_backend.so", folder / "gen_double"
+    generate(weights, SETTINGS, generated)
     model = write_model(load_weights(weights), folder)
     objects = []
     for source, flags in ((model, ("-w",)), (HERE / "hpipm_qp.c", STRICT), (HERE / "hpipm_backend.c", STRICT)):

@@ -1,7 +1,7 @@
 /* Backend: estimator_c's own MHE, whatever build it is compiled with (double or float, any kernel).
  *
- * Variants: a kernel's name ("portable", "avx2", "avx512"; "" is the build's own choice), "feedback" behind it and a colon for one
- * sweep now and the rest in backend_finish(), or "reference", which also keeps the problem it solves. */
+ * Variants: a kernel's name ("portable", "avx2", "avx512"; "" is the processor's best), or "reference": portable, as many sweeps as
+ * the tolerance asks for, and the problem kept. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -9,12 +9,13 @@
 #include "mhe.h"
 #include "window.h"
 
+enum { REFERENCE_SWEEPS = 200 };
+
 typedef __typeof__(((mhe_t *)0)->prior[0]) value_t; /* double, or float in that build */
 
 static mhe_t mhe;
 static window_t window; /* of "reference" only */
 static bool reference;
-static bool started;
 static int sweeps_fixed;
 static double tolerance_given;
 static int loss_given = -1;
@@ -25,7 +26,8 @@ int backend_open(const char *variant, int sweeps, double tolerance, int loss)
     tolerance_given = tolerance;
     loss_given = loss;
     reference = strcmp(variant, "reference") == 0;
-    return reference || *variant == '\0' || strcmp(variant, "portable") == 0 ? 0 : 1;
+    const char *kernel = reference ? "portable" : *variant == '\0' ? NULL : variant;
+    return net_select(kernel) != NULL ? 0 : 1;
 }
 
 size_t backend_state_bytes(void)
@@ -49,11 +51,10 @@ static void init(const double at[])
     setting.lower_degc = at[SETTING_LOWER];
     setting.upper_degc = at[SETTING_UPPER];
     setting.bound_weight = at[SETTING_BOUND_WEIGHT];
-    setting.max_sweeps = sweeps_fixed > 0 ? sweeps_fixed : (int32_t)at[SETTING_MAX_SWEEPS];
+    setting.max_sweeps = sweeps_fixed > 0 ? sweeps_fixed : reference ? REFERENCE_SWEEPS : (int32_t)at[SETTING_MAX_SWEEPS];
     setting.tolerance_degc = sweeps_fixed > 0 ? 0.0 : tolerance_given > 0.0 ? tolerance_given : at[SETTING_TOLERANCE];
     setting.newest_measurement = at[SETTING_NEWEST] != 0.0;
     mhe_init(&mhe, &setting);
-    started = false;
 }
 
 static void convert(value_t to[], const double from[], int n)
@@ -77,7 +78,6 @@ void backend_call(const double record[])
         convert(a, at, 2);
         convert(memory, at + 2, NET_MEMORY);
         mhe_start(&mhe, a, memory);
-        started = true;
         break;
     case STREAM_ADVANCE:
         convert(a, at, 2);
@@ -124,9 +124,9 @@ void backend_solve(const double ahead[][2], int steps, backend_result_t *result)
         .status = (int)status,
     };
     value_t theta[2] = {solved.theta[0], solved.theta[1]};
-    value_t memory[NET_MEMORY];
+    _Alignas(64) value_t memory[NET_MEMORY];
     value_t rate[2];
-    value_t tape[NET_TAPE];
+    _Alignas(64) value_t tape[NET_TAPE];
     memcpy(memory, mhe_node(&mhe, 0)->memory, sizeof memory);
     for (int k = 0; k < steps; k++) {
         value_t u[2];

@@ -101,6 +101,9 @@ class Recorder:
     def __init__(self, weights: Path) -> None:
         wraps = ",".join(f"--wrap=mhe_{name}" for name in WRAPPED)
         self._lib = Lib(compile_library(weights, ("-O2", f"-Wl,{wraps}", str(HERE / "recorder.c"))))
+        self._lib.c.net_select.restype = ct.c_char_p
+        if self._lib.c.net_select(b"portable") is None:  # the same bytes on every machine
+            raise ValueError(f"{weights}: the generated net has no portable kernel")
         self._lib.c.recorder_take.restype = ct.c_size_t
 
     def record(self, situation: Situation, lap: Lap) -> Segment:
