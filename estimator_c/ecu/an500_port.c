@@ -1,8 +1,8 @@
 /* The port of qemu-system-arm -M mps2-an500 -icount shift=10 with semihosting.
  *
- * An instruction takes 1024 ns of virtual time there and the board's timers count 25 MHz of it, so an instruction is 25.6 ticks
- * and a difference of two readings says how many there were, exactly. No cycle counter (DWT) is emulated, nor anything
- * that would give it a meaning: pipeline, caches, flash wait states. */
+ * An instruction takes 1024 ns of virtual time there and the board's timers count 25 MHz of it, so an instruction is
+ * 25.6 ticks and a difference of two readings says how many there were, exactly. No cycle counter (DWT) is emulated,
+ * nor anything that would give it a meaning: pipeline, caches, flash wait states. */
 #include "port.h"
 
 #include <string.h>
@@ -21,7 +21,7 @@ static uint8_t in[BUFFER], out[BUFFER];
 static size_t in_at, in_end, out_end;
 static uint32_t in_file, out_file;
 
-extern uint32_t stack_bottom[];
+enum { PAINTED_WORDS = 4096, OWN_WORDS = 16 }; /* below the caller; of them, left to the painter's own frame */
 static uint32_t *painted_top;
 static const uint32_t PAINT = 0xC5C5C5C5u;
 
@@ -99,19 +99,19 @@ uint32_t port_ticks(void)
 
 void port_stack_paint(void)
 {
-    painted_top = (uint32_t *)__builtin_frame_address(0) - 16; /* leave this function's own frame alone */
-    for (uint32_t *word = stack_bottom; word < painted_top; word++) {
+    painted_top = (uint32_t *)__builtin_frame_address(0) - OWN_WORDS;
+    for (uint32_t *word = painted_top - PAINTED_WORDS; word < painted_top; word++) {
         *word = PAINT;
     }
 }
 
 uint32_t port_stack_depth(void)
 {
-    const uint32_t *word = stack_bottom;
+    const uint32_t *word = painted_top - PAINTED_WORDS;
     while (word < painted_top && *word == PAINT) {
         word++;
     }
-    return (uint32_t)((const uint8_t *)painted_top + 64 - (const uint8_t *)word);
+    return (uint32_t)(painted_top + OWN_WORDS - word) * (uint32_t)sizeof *word;
 }
 
 uint32_t port_known_loop(uint32_t rounds)

@@ -1,4 +1,4 @@
-/* memcpy and memset: the two functions a freestanding C compiler may call on its own. Words where both ends are aligned. */
+/* memcpy and memset: what a C compiler calls on its own, without a C library. Words where both ends are aligned. */
 #include <stdint.h>
 #include <string.h>
 

@@ -1,7 +1,7 @@
 /* Recorded calls to the MHE, made again on the machine of port.h: the same source on the ECU and on the host.
  *
- * Reads the records of tools/solver_backends/stream.h, every number as real_t, little endian. Writes one
- * `first_t`, then an `answer_t` for each solution. Only the calls into the MHE are counted, reading and writing are not. */
+ * Reads the records of tools/solver_backends/stream.h, every number as real_t, little endian. Writes one `first_t`,
+ * then an `answer_t` for each solution. Only the calls into the MHE are counted, reading and writing are not. */
 #include <string.h>
 
 #include "mhe.h"
@@ -79,9 +79,12 @@ static void begin(void)
     setting.newest_measurement = (int32_t)payload[SETTING_NEWEST] != 0;
     setting.delay_steps = (int32_t)payload[SETTING_DELAY_STEPS];
     mhe_init(&mhe, &setting);
+    if (payload[SETTING_TOLERANCE] < 0) {
+        mhe.tolerance = payload[SETTING_TOLERANCE]; /* every sweep is made: mhe_init() holds it above rounding */
+    }
 }
 
-/* One call, counted. `STACK` and `COUNT` keep the counted region free of anything but the call. */
+/* One call into the MHE has ended. */
 static void count(int part, uint32_t begun)
 {
     const uint32_t ticks = port_ticks() - begun;
@@ -120,7 +123,7 @@ static bool call(int op, int length)
         return false;
     }
     port_stack_paint();
-    uint32_t begun = port_ticks();
+    const uint32_t begun = port_ticks();
     switch (op) {
     case STREAM_ADVANCE:
         mhe_advance(&mhe, p);
