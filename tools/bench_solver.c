@@ -7,9 +7,10 @@
  * Backends take turns of BLOCK steps, each turn begun by another one, so that all of them see the same noise of the machine;
  * within a turn the caches are warm but for its first step. REPEATS whole passes; the shortest time of each step counts.
  * SKIP: steps at the head of each segment that are run but neither timed nor counted. Instructions: callgrind with
- * --toggle-collect=timed_step.
+ * --toggle-collect='timed_*'.
  *
- * OUT, doubles: per backend and step COLUMNS values; then, for every EVERY-th step (0: none) and each backend, 1 + 32 doubles of
+ * OUT, doubles: per backend and step COLUMNS values (ns of the step, of its solve, of its run forward; theta, theta ahead, kkt,
+ * sweeps, status); then, for every EVERY-th step (0: none) and each backend, 1 + 32 doubles of
  * the window's temperatures (their number first), and the first backend's problem (length first, padded).
  * Prints "steps backends chosen problem-doubles", then the state's bytes per backend. */
 #include <dlfcn.h>
@@ -23,13 +24,14 @@
 #include "solver_backends/backend.h"
 #include "solver_backends/stream.h"
 
-enum { MAX_BACKENDS = 24, MAX_AHEAD = 64, COLUMNS = 8, WINDOW_DOUBLES = 33, PROBLEM_DOUBLES = 512 };
+enum { MAX_BACKENDS = 24, MAX_AHEAD = 64, COLUMNS = 10, WINDOW_DOUBLES = 33, PROBLEM_DOUBLES = 512 };
 
 typedef struct {
     int (*open)(const char *, int, double, int);
     size_t (*state_bytes)(void);
     void (*call)(const double *);
-    void (*solve)(const double (*)[2], int, backend_result_t *);
+    void (*solve)(backend_result_t *);
+    void (*ahead)(const double (*)[2], int, backend_result_t *);
     void (*finish)(void);
     int (*window)(double (*)[2]);
     int (*problem)(double *);
@@ -46,22 +48,38 @@ static backend_t backend[MAX_BACKENDS];
 static step_t *step;
 static int steps;
 
-void timed_step(const backend_t *self, const step_t *at, backend_result_t *result);
+void timed_calls(const backend_t *self, const step_t *at);
+void timed_solve(const backend_t *self, backend_result_t *result);
+void timed_ahead(const backend_t *self, const step_t *at, backend_result_t *result);
 
-static const double *calls(const backend_t *self, const step_t *at)
+static void calls(const backend_t *self, const step_t *at)
 {
-    const double *record = at->first;
-    for (; (int)record[0] != STREAM_SOLVE; record += 2 + (int)record[1]) {
+    for (const double *record = at->first; (int)record[0] != STREAM_SOLVE; record += 2 + (int)record[1]) {
         self->call(record);
     }
-    return record;
 }
 
-/* External and not inlined: callgrind finds it by its name. */
-__attribute__((noinline)) void timed_step(const backend_t *self, const step_t *at, backend_result_t *result)
+/* The three parts of a step that count: external and not inlined, callgrind finds them by their names. */
+__attribute__((noinline)) void timed_calls(const backend_t *self, const step_t *at)
 {
-    (void)calls(self, at);
-    self->solve((const double (*)[2])at->u, at->ahead, result);
+    calls(self, at);
+}
+
+__attribute__((noinline)) void timed_solve(const backend_t *self, backend_result_t *result)
+{
+    self->solve(result);
+}
+
+__attribute__((noinline)) void timed_ahead(const backend_t *self, const step_t *at, backend_result_t *result)
+{
+    self->ahead((const double (*)[2])at->u, at->ahead, result);
+}
+
+static void plain_step(const backend_t *self, const step_t *at, backend_result_t *result)
+{
+    calls(self, at);
+    self->solve(result);
+    self->ahead((const double (*)[2])at->u, at->ahead, result);
 }
 
 static void fail(const char *what, const char *why)
@@ -87,6 +105,7 @@ static void load(backend_t *self, char *text)
     *(void **)&self->state_bytes = dlsym(library, "backend_state_bytes");
     *(void **)&self->call = dlsym(library, "backend_call");
     *(void **)&self->solve = dlsym(library, "backend_solve");
+    *(void **)&self->ahead = dlsym(library, "backend_ahead");
     *(void **)&self->finish = dlsym(library, "backend_finish");
     *(void **)&self->window = dlsym(library, "backend_window");
     *(void **)&self->problem = dlsym(library, "backend_problem");
@@ -165,6 +184,31 @@ static double now_ns(void)
     return 1e9 * (double)t.tv_sec + (double)t.tv_nsec;
 }
 
+static void keep_shorter(double *kept, double took, bool first)
+{
+    *kept = first || took < *kept ? took : *kept;
+}
+
+/* One step; row: shortest total, solve and run forward so far, ns. problem: where the problem goes, or NULL. */
+static void timed_parts(const backend_t *self, const step_t *at, backend_result_t *result, double *problem, bool first,
+                        double row[3])
+{
+    const double begin = now_ns();
+    timed_calls(self, at);
+    const double called = now_ns();
+    if (problem != NULL) {
+        problem[0] = self->problem(problem + 1);
+    }
+    const double ready = now_ns();
+    timed_solve(self, result);
+    const double solved = now_ns();
+    timed_ahead(self, at, result);
+    const double end = now_ns();
+    keep_shorter(&row[0], called - begin + end - ready, first);
+    keep_shorter(&row[1], solved - ready, first);
+    keep_shorter(&row[2], end - solved, first);
+}
+
 int main(int argc, char **argv)
 {
     int block = 64;
@@ -201,7 +245,7 @@ int main(int argc, char **argv)
     for (int b = 0; b < backends; b++) {
         load(&backend[b], argv[option + b]);
     }
-    double *out = calloc((size_t)backends * (size_t)steps * COLUMNS, sizeof *out);
+    double *out = calloc((size_t)backends * (size_t)steps * COLUMNS + 1, sizeof *out);
     const int chosen = every > 0 ? (steps + every - 1) / every : 0;
     double *window = calloc((size_t)chosen * (size_t)backends * WINDOW_DOUBLES + 1, sizeof *window);
     double *problem = calloc((size_t)chosen * PROBLEM_DOUBLES + 1, sizeof *problem);
@@ -217,26 +261,17 @@ int main(int argc, char **argv)
                     backend_result_t result;
                     double *row = out + ((size_t)b * (size_t)steps + (size_t)k) * COLUMNS;
                     const bool asked = pass == 0 && every > 0 && k % every == 0;
-                    if (b == 0 && asked) { /* the first one keeps the problem: it is not timed in earnest */
-                        const size_t at = (size_t)(k / every);
-                        (void)calls(&backend[0], &step[k]);
-                        const int size = backend[0].problem(problem + at * PROBLEM_DOUBLES + 1);
-                        problem[at * PROBLEM_DOUBLES] = size;
-                        backend[0].solve((const double (*)[2])step[k].u, step[k].ahead, &result);
-                    } else if (step[k].in_segment < skip) {
-                        (void)calls(&backend[b], &step[k]);
-                        backend[b].solve((const double (*)[2])step[k].u, step[k].ahead, &result);
-                        row[0] = -1.0;
+                    if (step[k].in_segment < skip) {
+                        plain_step(&backend[b], &step[k], &result);
+                        row[0] = row[1] = row[2] = -1.0;
                     } else {
-                        const double begin = now_ns();
-                        timed_step(&backend[b], &step[k], &result);
-                        const double took = now_ns() - begin;
-                        row[0] = pass == 0 || took < row[0] ? took : row[0];
+                        double *kept = b == 0 && asked ? problem + (size_t)(k / every) * PROBLEM_DOUBLES : NULL;
+                        timed_parts(&backend[b], &step[k], &result, kept, pass == 0, row);
                     }
                     backend[b].finish();
-                    const double rest[COLUMNS - 1] = {result.theta[0], result.theta[1], result.ahead[0], result.ahead[1],
+                    const double rest[COLUMNS - 3] = {result.theta[0], result.theta[1], result.ahead[0], result.ahead[1],
                                                       result.kkt_degc, result.sweeps,   result.status};
-                    memcpy(row + 1, rest, sizeof rest);
+                    memcpy(row + 3, rest, sizeof rest);
                     if (asked) {
                         double *at = window + ((size_t)(k / every) * (size_t)backends + (size_t)b) * WINDOW_DOUBLES;
                         at[0] = backend[b].window((double (*)[2])(at + 1));
@@ -249,10 +284,12 @@ int main(int argc, char **argv)
     if (file == NULL) {
         fail(argv[2], "cannot be written");
     }
-    size_t written = fwrite(out, sizeof *out, (size_t)backends * (size_t)steps * COLUMNS, file);
-    written += fwrite(window, sizeof *window, (size_t)chosen * (size_t)backends * WINDOW_DOUBLES, file);
-    written += fwrite(problem, sizeof *problem, (size_t)chosen * PROBLEM_DOUBLES, file);
-    if (fclose(file) != 0 || written == 0) {
+    const size_t sizes[3] = {(size_t)backends * (size_t)steps * COLUMNS,
+                             (size_t)chosen * (size_t)backends * WINDOW_DOUBLES, (size_t)chosen * PROBLEM_DOUBLES};
+    bool whole = fwrite(out, sizeof *out, sizes[0], file) == sizes[0];
+    whole = fwrite(window, sizeof *window, sizes[1], file) == sizes[1] && whole;
+    whole = fwrite(problem, sizeof *problem, sizes[2], file) == sizes[2] && whole;
+    if (fclose(file) != 0 || !whole) {
         fail(argv[2], "cannot be written");
     }
     printf("%d %d %d %d\n", steps, backends, chosen, PROBLEM_DOUBLES);

@@ -91,15 +91,19 @@ class MheOracle:
         self.weights, self.statement = weights, statement
         self._solvers: dict[tuple[int, bool, str], ca.Function] = {}
 
-    def solve(self, problem: MheProblem, guess: Array | None = None) -> Array:
-        """Temperatures of all nodes (m + 1, 2) in degC; raises RuntimeError if ipopt fails."""
+    def prepare(self, problem: MheProblem) -> ca.Function:
+        """Build the NLP of problems of this kind and size, if there is none yet; for those who time `solve`."""
         if problem.loss not in LOSSES:
             raise ValueError(f"loss must be one of {', '.join(LOSSES)}, is {problem.loss!r}")
-        nodes, soft = len(problem.y), problem.bound_weight is not None
-        key = (nodes, soft, problem.loss)
+        key = (len(problem.y), problem.bound_weight is not None, problem.loss)
         if key not in self._solvers:
             self._solvers[key] = self._build(*key)
-        solver = self._solvers[key]
+        return self._solvers[key]
+
+    def solve(self, problem: MheProblem, guess: Array | None = None) -> Array:
+        """Temperatures of all nodes (m + 1, 2) in degC; raises RuntimeError if ipopt fails."""
+        nodes, soft = len(problem.y), problem.bound_weight is not None
+        solver = self.prepare(problem)
         start = self._start(problem, problem.y if guess is None else guess)
         low, high = self._bounds(problem, start.size, nodes, soft)
         g_high = np.zeros(solver.sparsity_out("g").numel())

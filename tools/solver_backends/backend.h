@@ -23,8 +23,11 @@ size_t backend_state_bytes(void);
 /* One record of the stream (stream.h) other than STREAM_SOLVE. */
 void backend_call(const double record[]);
 
-/* Solve, then run the net forward through ahead[0 .. steps - 1] (speed, torque). */
-void backend_solve(const double ahead[][2], int steps, backend_result_t *result);
+/* Solve; all of the result but `ahead`. */
+void backend_solve(backend_result_t *result);
+
+/* Run the net forward from the solution through u[0 .. steps - 1] (speed, torque): result->ahead. */
+void backend_ahead(const double u[][2], int steps, backend_result_t *result);
 
 /* After publishing: what a solver that answers early has left to do. Not timed. */
 void backend_finish(void);

@@ -214,7 +214,7 @@ static double iterate(bool *solved)
     return take(qp);
 }
 
-void backend_solve(const double ahead[][2], int steps, backend_result_t *result)
+void backend_solve(backend_result_t *result)
 {
     const int most = sweeps_fixed > 0 ? sweeps_fixed : (int)window.setting[SETTING_MAX_SWEEPS];
     const double tolerance =
@@ -232,19 +232,21 @@ void backend_solve(const double ahead[][2], int steps, backend_result_t *result)
         }
     }
     const window_node_t *newest = &window.node[window.count - 1];
-    double theta[2] = {newest->theta[0], newest->theta[1]};
-    double memory[NET_MEMORY];
-    memcpy(memory, newest->memory, sizeof memory);
-    result->theta[0] = theta[0];
-    result->theta[1] = theta[1];
-    if (!isfinite(theta[0] + theta[1])) {
+    result->theta[0] = newest->theta[0];
+    result->theta[1] = newest->theta[1];
+    if (!isfinite(newest->theta[0] + newest->theta[1])) {
         result->status = 2;
     }
+}
+
+void backend_ahead(const double u[][2], int steps, backend_result_t *result)
+{
+    double memory[NET_MEMORY];
+    memcpy(result->ahead, result->theta, sizeof result->ahead);
+    memcpy(memory, window.node[window.count - 1].memory, sizeof memory);
     for (int k = 0; k < steps; k++) {
-        model_ahead(ahead[k], theta, memory);
+        model_ahead(u[k], result->ahead, memory);
     }
-    result->ahead[0] = theta[0];
-    result->ahead[1] = theta[1];
 }
 
 void backend_finish(void)

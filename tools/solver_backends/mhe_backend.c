@@ -113,7 +113,7 @@ void backend_call(const double record[])
     }
 }
 
-void backend_solve(const double ahead[][2], int steps, backend_result_t *result)
+void backend_solve(backend_result_t *result)
 {
     mhe_result_t solved;
     const mhe_status_t status = mhe_solve(&mhe, &solved);
@@ -123,14 +123,19 @@ void backend_solve(const double ahead[][2], int steps, backend_result_t *result)
         .sweeps = solved.sweeps,
         .status = (int)status,
     };
-    value_t theta[2] = {solved.theta[0], solved.theta[1]};
+}
+
+void backend_ahead(const double inputs[][2], int steps, backend_result_t *result)
+{
+    value_t theta[2];
     _Alignas(64) value_t memory[NET_MEMORY];
     value_t rate[2];
     _Alignas(64) value_t tape[NET_TAPE];
+    convert(theta, result->theta, 2);
     memcpy(memory, mhe_node(&mhe, 0)->memory, sizeof memory);
     for (int k = 0; k < steps; k++) {
         value_t u[2];
-        convert(u, ahead[k], 2);
+        convert(u, inputs[k], 2);
         net_forward(u, theta, memory, memory, rate, tape);
         for (int ch = 0; ch < MHE_CHANNELS; ch++) {
             theta[ch] += (value_t)NET_DT_S * rate[ch];
