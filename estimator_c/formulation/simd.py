@@ -197,18 +197,22 @@ class _Kernel:
                 self._sum(f"q_{tag}", self._weight(f"bias_{layer}", 3, chunk), back, 2)
             else:
                 self._sum(f"a_{gate}_{tag}", f"x_{gate}_{tag}", back, 2)
-        sigmoids = "ifo" if self.lstm else "rz"
-        for gate in sigmoids:
+        for gate in "ifo" if self.lstm else "rz":
             out.let(f"{gate}_{tag}", f"vec_gate(a_{gate}_{tag})")
-        if self.lstm:
-            out.let(f"g_{tag}", f"vec_tanh_of_gate(vec_gate(a_g_{tag}))")
+        if self.lstm:  # written so that as little as can be waits for the next: the tanh's 2 s - 1 melts into products
+            tanh = _number(TANH)
             c = self._load("memory", self._c(layer), chunk)
-            out.let(f"c_{tag}", f"vec_fma(f_{tag}, {c}, vec_mul(i_{tag}, g_{tag}))")
-            out.let(f"t_{tag}", f"vec_tanh_of_gate(vec_gate(vec_mul(c_{tag}, vec_all({_number(TANH)}))))")
-            out.let(f"h_{tag}", f"vec_mul(o_{tag}, t_{tag})")
+            out.let(f"s_g_{tag}", f"vec_gate(a_g_{tag})")
+            out.let(f"g_{tag}", f"vec_fma(vec_all(2.0), s_g_{tag}, vec_all(-1.0))")
+            out.let(f"ig_{tag}", f"vec_fma(vec_add(i_{tag}, i_{tag}), s_g_{tag}, vec_neg(i_{tag}))")
+            out.let(f"c_{tag}", f"vec_fma(f_{tag}, {c}, ig_{tag})")
+            out.let(f"a_t_{tag}", f"vec_fma(f_{tag}, vec_mul({c}, vec_all({tanh})), vec_mul(ig_{tag}, vec_all({tanh})))")
+            out.let(f"s_t_{tag}", f"vec_gate(a_t_{tag})")
+            out.let(f"t_{tag}", f"vec_fma(vec_all(2.0), s_t_{tag}, vec_all(-1.0))")
+            out.let(f"h_{tag}", f"vec_fma(vec_add(o_{tag}, o_{tag}), s_t_{tag}, vec_neg(o_{tag}))")
         else:
             out.let(f"a_n_{tag}", f"vec_fma(vec_mul(r_{tag}, q_{tag}), vec_all({_number(TANH)}), x_n_{tag})")
-            out.let(f"n_{tag}", f"vec_tanh_of_gate(vec_gate(a_n_{tag}))")
+            out.let(f"n_{tag}", f"vec_fma(vec_all(2.0), vec_gate(a_n_{tag}), vec_all(-1.0))")
             old = self._load("memory", self._h(layer), chunk)
             out.let(f"h_{tag}", f"vec_fma(z_{tag}, vec_sub({old}, n_{tag}), n_{tag})")
         for g, gate in enumerate(self.names):

@@ -1,10 +1,11 @@
 #include "mhe.h"
 
-#include <math.h> /* NAN only: no function of libm is called */
 #include <string.h>
 
-/* Rounding of temperatures around 100 degC leaves changes of that size: 3 nK with double, 1.5 mK/100 with float. */
+/* Rounding of temperatures around 100 degC leaves changes of that size: nothing with double, 15 uK with float. */
 static const real_t TOLERANCE_FLOOR_DEGC = 128 * REAL_EPSILON;
+
+static const real_t SHRINK = (real_t)0.5; /* a sweep that leaves more of the change than this was too bold */
 
 /* k = 0 is the oldest node of the window. */
 static inline mhe_node_t *at(mhe_t *self, int k)
@@ -49,6 +50,7 @@ void mhe_start(mhe_t *self, const real_t prior[MHE_CHANNELS], const real_t memor
     self->head = 0;
     self->count = 1;
     self->full = false;
+    self->stale = false;
     mhe_node_t *node = at(self, 0);
     memset(node, 0, sizeof *node);
     memcpy(node->memory, memory, sizeof node->memory);
@@ -71,6 +73,15 @@ static void forward_sweep(mhe_t *self)
     for (int k = 0; k + 1 < self->count; k++) {
         stage_forward(self, k);
     }
+    self->stale = false;
+}
+
+/* Bring the stages to the present temperatures, which the last sweep has moved. */
+static void refresh(mhe_t *self)
+{
+    if (self->stale) {
+        forward_sweep(self);
+    }
 }
 
 /* 1 + dt dF/dtheta enters the matrix only, so it is taken once, when the stage is new. Kept positive so that the
@@ -87,6 +98,7 @@ static void stage_slope(mhe_t *self, int k)
 
 void mhe_advance(mhe_t *self, const real_t u[2])
 {
+    refresh(self);
     if (self->count == MHE_NODES) {
         self->head = (self->head + 1) & (MHE_NODES - 1);
         self->count--;
@@ -159,10 +171,25 @@ static real_t loss_weight(const mhe_t *self, real_t r)
 {
     const real_t x = r / self->loss_scale;
     if (self->loss == EST_LOSS_GEMAN_MCCLURE) {
-        const real_t d = 1 + x * x;
-        return 1 / (d * d);
+        const real_t d = 1 / (1 + x * x);
+        return d * d;
     }
     return self->loss == EST_LOSS_HUBER ? 1 / real_max(real_abs(x), 1) : 1;
+}
+
+/* What residual r adds to the matrix. `careful`: the weight, a parabola above the loss that touches it, so that no step can
+ * climb. Else the loss's own curvature, which ends in fewer sweeps, where that is not negative. */
+static real_t loss_curvature(const mhe_t *self, real_t r, bool careful)
+{
+    if (careful) {
+        return loss_weight(self, r);
+    }
+    const real_t x = r / self->loss_scale;
+    if (self->loss == EST_LOSS_GEMAN_MCCLURE) {
+        const real_t d = 1 / (1 + x * x);
+        return real_max((1 - 3 * x * x) * d * d * d, 0);
+    }
+    return self->loss == EST_LOSS_HUBER && real_abs(x) > 1 ? 0 : 1;
 }
 
 /* The loss itself over its scale squared is rho(x); here times the scale squared, 1/2 r^2 where r is small. */
@@ -211,7 +238,7 @@ static void adjoint_sweep(mhe_t *self)
 
 /* Gauss-Newton matrix of each channel with the direct slope of each stage; constant within a step unless the loss weighs
  * the residuals anew. */
-static void factor(mhe_t *self)
+static void factor(mhe_t *self, bool careful)
 {
     const real_t *p0 = arrival_weight(self);
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
@@ -223,7 +250,7 @@ static void factor(mhe_t *self)
             const real_t leaving = k + 1 < self->count ? ww * a * a : 0;
             const real_t arriving = k > 0 ? ww : p0[ch];
             const real_t residual = at(self, k)->theta[ch] - at(self, k)->y[ch];
-            qp->diag[k] = arriving + leaving + weight_at(self, k, ch) * loss_weight(self, residual);
+            qp->diag[k] = arriving + leaving + weight_at(self, k, ch) * loss_curvature(self, residual, careful);
             qp->off[k] = -ww * a;
         }
         box_qp_factor(qp);
@@ -252,35 +279,35 @@ static real_t tridiagonal_step(mhe_t *self, real_t step[MHE_CHANNELS][MHE_NODES]
     return real_finite(sum) ? largest : (real_t)NAN;
 }
 
-mhe_status_t mhe_solve(mhe_t *self, mhe_result_t *result)
+/* One sweep from up-to-date stages: where the next solve would go, and there unless the tolerance is met. */
+static void sweep(mhe_t *self, mhe_result_t *result)
 {
     real_t step[MHE_CHANNELS][MHE_NODES];
-    *result = (mhe_result_t){.theta = {(real_t)NAN, (real_t)NAN}, .kkt_degc = (real_t)NAN};
-    if (self->count == 0) {
-        return MHE_INVALID;
+    const real_t before = result->kkt_degc;
+    bool settled = true;
+    if (result->sweeps == 0 || self->loss != EST_LOSS_QUADRATIC) {
+        factor(self, self->careful);
     }
-    mhe_status_t status = MHE_MAX_SWEEPS;
-    /* The stages are up to date on entry: old ones from the last solve, the newest from mhe_advance(). */
-    while (result->sweeps < self->max_sweeps) {
-        bool settled = true;
-        if (result->sweeps == 0 || self->loss != EST_LOSS_QUADRATIC) {
-            factor(self);
-        }
-        adjoint_sweep(self);
-        result->kkt_degc = tridiagonal_step(self, step, &result->active, &settled);
-        result->sweeps++;
-        if (result->kkt_degc <= self->tolerance && settled) {
-            status = MHE_OK;
-            break;
-        }
-        for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-            for (int k = 0; k < self->count; k++) {
-                at(self, k)->theta[ch] += step[ch][k];
-            }
-        }
-        forward_sweep(self);
+    adjoint_sweep(self);
+    result->kkt_degc = tridiagonal_step(self, step, &result->active, &settled);
+    result->sweeps++;
+    self->careful = self->careful || (result->sweeps > 1 && !(result->kkt_degc < SHRINK * before));
+    self->converged = result->kkt_degc <= self->tolerance && settled;
+    if (self->converged) {
+        return;
     }
-    const mhe_node_t *newest = at(self, self->count - 1);
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        for (int k = 0; k < self->count; k++) {
+            at(self, k)->theta[ch] += step[ch][k];
+        }
+    }
+    self->stale = true;
+}
+
+/* Close the books of a solve: the estimate, and whether all of it is finite. */
+static mhe_status_t conclude(const mhe_t *self, mhe_result_t *result)
+{
+    const mhe_node_t *newest = mhe_node(self, 0);
     real_t sum = result->kkt_degc;
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         result->theta[ch] = newest->theta[ch];
@@ -289,7 +316,39 @@ mhe_status_t mhe_solve(mhe_t *self, mhe_result_t *result)
     for (int k = 0; k < NET_MEMORY; k++) {
         sum += newest->memory[k];
     }
-    return real_finite(sum) ? status : MHE_INVALID;
+    return !real_finite(sum) ? MHE_INVALID : self->converged ? MHE_OK : MHE_MAX_SWEEPS;
+}
+
+mhe_status_t mhe_feedback(mhe_t *self, mhe_result_t *result)
+{
+    *result = (mhe_result_t){.theta = {(real_t)NAN, (real_t)NAN}, .kkt_degc = (real_t)NAN};
+    if (self->count == 0) {
+        return MHE_INVALID;
+    }
+    /* The stages are up to date on entry: old ones from the last solve, the newest from mhe_advance(). */
+    refresh(self);
+    self->careful = false;
+    sweep(self, result);
+    return conclude(self, result);
+}
+
+mhe_status_t mhe_finish(mhe_t *self, mhe_result_t *result)
+{
+    if (self->count == 0) {
+        return MHE_INVALID;
+    }
+    refresh(self);
+    while (!self->converged && result->sweeps < self->max_sweeps) {
+        sweep(self, result);
+        refresh(self);
+    }
+    return conclude(self, result);
+}
+
+mhe_status_t mhe_solve(mhe_t *self, mhe_result_t *result)
+{
+    const mhe_status_t status = mhe_feedback(self, result);
+    return status == MHE_INVALID ? status : mhe_finish(self, result);
 }
 
 real_t mhe_cost(mhe_t *self, real_t gradient[][MHE_CHANNELS])

@@ -56,6 +56,9 @@ typedef struct {
     int head;                    /* ring index of the oldest node */
     int count;                   /* nodes in the window, 0 before mhe_start() */
     bool full;                   /* the window has shifted at least once: arrival weight instead of prior weight */
+    bool stale;                  /* temperatures have moved since the stages were computed */
+    bool careful;                /* this solve keeps to the loss's majorant */
+    bool converged;              /* so far */
     real_t prior[MHE_CHANNELS];  /* theta bar of the oldest node */
     box_qp_t qp[MHE_CHANNELS];
 } mhe_t;
@@ -92,8 +95,15 @@ void mhe_forget(mhe_t *self, int channel, int nodes);
 /* Move the whole window of one channel by `shift` degC: the level was wrong, the course was not. */
 void mhe_shift(mhe_t *self, int channel, real_t shift);
 
-/* Solve from the present window. Cost: (sweeps - 1) forward passes and `sweeps` adjoint passes over the window. */
+/* Solve from the present window: to the tolerance, or as many sweeps as allowed (a tolerance of 0 makes that a fixed
+ * number). Cost: (sweeps - 1) forward passes and `sweeps` adjoint passes over the window. The same as mhe_feedback() and mhe_finish() at once. */
 mhe_status_t mhe_solve(mhe_t *self, mhe_result_t *result);
+
+/* The estimate after the first sweep alone: one adjoint pass and one solve, no forward pass. MHE_MAX_SWEEPS: there is more to do,
+ * and mhe_finish() with the same result, after publishing, does it; it returns what mhe_solve() would have. Until then
+ * the memory in the window's nodes is that of before the sweep. */
+mhe_status_t mhe_feedback(mhe_t *self, mhe_result_t *result);
+mhe_status_t mhe_finish(mhe_t *self, mhe_result_t *result);
 
 /* The node `age` steps before the newest, NULL outside the window. The newest node's memory belongs to the solution. */
 const mhe_node_t *mhe_node(const mhe_t *self, int age);

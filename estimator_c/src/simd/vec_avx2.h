@@ -80,20 +80,28 @@ VEC_INLINE vec_t vec_fnma(vec_t a, vec_t b, vec_t c)
     return _mm256_fnmadd_pd(a, b, c);
 }
 
+VEC_INLINE vec_t vec_neg(vec_t a)
+{
+    return _mm256_xor_pd(a, vec_all(-0.0));
+}
+
 VEC_INLINE double vec_sum(vec_t x)
 {
     const __m128d two = _mm_add_pd(_mm256_castpd256_pd128(x), _mm256_extractf128_pd(x, 1));
     return _mm_cvtsd_f64(_mm_add_sd(two, _mm_unpackhi_pd(two, two)));
 }
 
-/* 1/(1 + 2^a), absolute error <= 3e-16; a is held within +-100, NaN gives NaN. The same polynomial as net_exp(). */
+/* 1/(1 + 2^a) for |a| < 1e15, absolute error <= 3e-16; 0 and 1 within 2^-64 where the power is held there; not finite gives
+ * NaN. The polynomial is that of net_gates(). The power of two is made beside the polynomial, which takes longer. */
 VEC_INLINE vec_t vec_gate(vec_t a)
 {
     const vec_t one = vec_all(1.0);
     const vec_t shift = vec_all(6755399441055744.0); /* 1.5 2^52: adding it rounds to a whole number */
-    a = _mm256_min_pd(vec_all(100.0), _mm256_max_pd(vec_all(-100.0), a)); /* the second operand where one is NaN */
     const vec_t shifted = vec_add(a, shift);
     const vec_t r = vec_sub(a, vec_sub(shifted, shift));
+    const vec_t held = _mm256_min_pd(vec_all(6755399441055744.0 + 63.0), _mm256_max_pd(vec_all(6755399441055744.0 - 64.0), shifted));
+    const __m256i bits = _mm256_slli_epi64(_mm256_add_epi64(_mm256_castpd_si256(held), _mm256_set1_epi64x(1023)), 52);
+    const vec_t scale = _mm256_castsi256_pd(bits);
     const vec_t r2 = vec_mul(r, r);
     const vec_t r4 = vec_mul(r2, r2);
     const vec_t r8 = vec_mul(r4, r4);
@@ -103,16 +111,8 @@ VEC_INLINE vec_t vec_gate(vec_t a)
     const vec_t p6 = vec_fma(r, vec_all(1.5252672924850737e-05), vec_all(0.00015403530424776529));
     const vec_t p8 = vec_fma(r, vec_all(1.0205905413765595e-07), vec_all(1.3215451633221434e-06));
     const vec_t low = vec_fma(vec_fma(r2, p6, p4), r4, vec_fma(r2, p2, p0));
-    const vec_t power = vec_fma(vec_fma(r2, vec_all(7.070977866508138e-09), p8), r8, low);
-    const __m256i exponent = _mm256_slli_epi64(_mm256_castpd_si256(shifted), 52);
-    const vec_t scaled = _mm256_castsi256_pd(_mm256_add_epi64(_mm256_castpd_si256(power), exponent));
-    return _mm256_div_pd(one, vec_add(one, scaled));
-}
-
-/* tanh z from the gate with a = -2 z/ln 2. */
-VEC_INLINE vec_t vec_tanh_of_gate(vec_t gate)
-{
-    return vec_sub(vec_add(gate, gate), vec_all(1.0));
+    const vec_t below = vec_fma(vec_fma(vec_fma(r2, vec_all(7.070977866508138e-09), p8), r8, low), scale, one);
+    return _mm256_div_pd(one, below);
 }
 
 #endif
