@@ -2,6 +2,7 @@
 # make test   every test, on every bus this machine can have
 # make check  ruff, pyright, import rules, DBC lint
 # make bench  plant step, MHE step, bus: times and instruction counts
+# make bench-ecu  the MHE step on an emulated Cortex-M7: instructions, flash, RAM, stack
 # make train  data set from the plant, then the net (about ten minutes)
 # make setup  .venv with rt-runner in it, and the C built
 SHELL  := /bin/bash
@@ -12,7 +13,7 @@ RT     := $(VENV)/bin/rt-runner
 BUILD  := build
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run test check setup build build-asan train bench clean help
+.PHONY: run test check setup build build-asan train bench bench-ecu clean help
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -62,6 +63,11 @@ bench: $(VENV)/.dev build
 	$(PY) -m tools.bench_plant
 	$(PY) -m tools.bench_mhe
 	$(PY) -m tools.bench_bus --bus hub
+
+bench-ecu: $(VENV)/.dev
+	@tools/apt-install gcc-arm-none-eabi qemu-system-arm
+	@mkdir -p $(BUILD)
+	$(PY) -m tools.bench_ecu --json $(BUILD)/bench-ecu.json
 
 train: $(VENV)/.dev
 	$(PY) -m tools.dataset --set R --seed 1 --out build/data/R.npz

@@ -2,8 +2,11 @@
 
 Two statements of one problem over nodes k = 0..m (theta in degC, rates in degC/s):
 
-    min 1/2 |theta_0 - prior|^2_P0 + 1/2 sum_k |y_k - theta_k|^2_Wy,k + 1/2 sum_k |w_k|^2_Ww
+    min 1/2 |theta_0 - prior|^2_P0 + sum_k Wy,k s^2 rho((y_k - theta_k)/s) + 1/2 sum_k |w_k|^2_Ww
     theta_{k+1} = theta_k + dt F(u_k, theta_k, c_k, h_k) + w_k,   (c, h)_{k+1} = LSTM(u_k, theta_k, c_k, h_k)
+
+rho(x) = x^2/2 (quadratic; s does not matter), |x| - 1/2 beyond |x| = 1 (Huber 1964), or x^2/2/(1 + x^2) (Geman and McClure 1987),
+which is not convex: the minimum found is the one whose valley the guess lies in.
 
 `shooting`: unknowns theta, c, h of all nodes and w of all stages, the dynamics as equality constraints.
 `theta`: w eliminated and c, h substituted; unknowns theta alone. Both have the same solution.
@@ -40,6 +43,9 @@ IPOPT = {
 }
 
 
+LOSSES = ("quadratic", "huber", "geman-mcclure")  # in the order of EST_LOSS_...
+
+
 @dataclass(frozen=True)
 class MheProblem:
     """The data of one window of m + 1 nodes.
@@ -58,6 +64,8 @@ class MheProblem:
         Bounds on all temperatures, degC.
     bound_weight : float or None
         Penalty of soft bounds in 1/K² per node; None = hard box.
+    loss, loss_scale : str, float
+        One of LOSSES, and s in degC.
     """
 
     u: Array
@@ -70,6 +78,8 @@ class MheProblem:
     lower: float = -np.inf
     upper: float = np.inf
     bound_weight: float | None = None
+    loss: str = "quadratic"
+    loss_scale: float = 1.0
 
 
 class MheOracle:
@@ -79,14 +89,21 @@ class MheOracle:
         if statement not in ("theta", "shooting"):
             raise ValueError(f"statement must be 'theta' or 'shooting', is {statement!r}")
         self.weights, self.statement = weights, statement
-        self._solvers: dict[tuple[int, bool], ca.Function] = {}
+        self._solvers: dict[tuple[int, bool, str], ca.Function] = {}
+
+    def prepare(self, problem: MheProblem) -> ca.Function:
+        """Build the NLP of problems of this kind and size, if there is none yet; for those who time `solve`."""
+        if problem.loss not in LOSSES:
+            raise ValueError(f"loss must be one of {', '.join(LOSSES)}, is {problem.loss!r}")
+        key = (len(problem.y), problem.bound_weight is not None, problem.loss)
+        if key not in self._solvers:
+            self._solvers[key] = self._build(*key)
+        return self._solvers[key]
 
     def solve(self, problem: MheProblem, guess: Array | None = None) -> Array:
         """Temperatures of all nodes (m + 1, 2) in degC; raises RuntimeError if ipopt fails."""
         nodes, soft = len(problem.y), problem.bound_weight is not None
-        if (nodes, soft) not in self._solvers:
-            self._solvers[nodes, soft] = self._build(nodes, soft)
-        solver = self._solvers[nodes, soft]
+        solver = self.prepare(problem)
         start = self._start(problem, problem.y if guess is None else guess)
         low, high = self._bounds(problem, start.size, nodes, soft)
         g_high = np.zeros(solver.sparsity_out("g").numel())
@@ -98,7 +115,7 @@ class MheOracle:
             raise RuntimeError(f"ipopt: {stats['return_status']}")
         return np.array(out["x"][: 2 * nodes]).reshape(nodes, 2)
 
-    def _build(self, nodes: int, soft: bool) -> ca.Function:
+    def _build(self, nodes: int, soft: bool, loss: str) -> ca.Function:
         n_m, dt_s = self.weights.memory, self.weights.dt_s
         net = build_net(self.weights).forward
         theta = ca.SX.sym("theta", 2, nodes)
@@ -111,10 +128,11 @@ class MheOracle:
             "ww": ca.SX.sym("ww", 2),
             "memory": ca.SX.sym("memory", n_m),
             "bounds": ca.SX.sym("bounds", 3),
+            "scale": ca.SX.sym("scale"),
         }
         unknowns, constraints = [ca.vec(theta)], []
         cost = 0.5 * ca.dot(p["p0"], (theta[:, 0] - p["prior"]) ** 2)
-        cost += 0.5 * ca.dot(p["weight"], (theta - p["y"]) ** 2)
+        cost += ca.dot(p["weight"], _loss(loss, theta - p["y"], p["scale"]))
         memory = p["memory"]
         for k in range(nodes - 1):
             memory_next, rate, _ = net(p["u"][:, k], theta[:, k], memory)
@@ -164,12 +182,20 @@ class MheOracle:
         return low, high
 
 
+def _loss(loss: str, residual: ca.SX, scale: ca.SX) -> ca.SX:
+    """s^2 rho(r/s), element by element."""
+    square = 0.5 * residual**2
+    if loss == "huber":
+        return ca.if_else(ca.fabs(residual) > scale, scale * (ca.fabs(residual) - 0.5 * scale), square)
+    return square / (1 + (residual / scale) ** 2) if loss == "geman-mcclure" else square
+
+
 def _parameters(problem: MheProblem) -> Array:
     bounds = np.nan_to_num(
         np.array([problem.lower, problem.upper, problem.bound_weight or 0.0]), posinf=1e9, neginf=-1e9
     )
     parts = (
         problem.u, problem.y, problem.weight, problem.prior, problem.weight_arrival, problem.weight_noise,
-        problem.memory, bounds,
+        problem.memory, bounds, problem.loss_scale,
     )  # fmt: skip
     return np.concatenate([np.asarray(part, dtype=np.float64).ravel() for part in parts])

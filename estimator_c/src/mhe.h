@@ -18,6 +18,7 @@
 
 #include "box_qp.h"
 #include "est_settings.h"
+#include "real.h"
 #include "thermal_net.h"
 
 #define MHE_NODES 16 /* N = 15 stages; a power of two, the window is a ring */
@@ -30,23 +31,23 @@ typedef enum {
 } mhe_status_t;
 
 typedef struct {
-    double theta[MHE_CHANNELS];  /* the estimate at this node */
-    double u[2];                 /* [speed rpm, torque Nm] of the stage that leaves this node */
-    double y[MHE_CHANNELS];      /* measurement, offset removed */
-    double weight[MHE_CHANNELS]; /* Wy, or 0 where there is none */
-    double memory[NET_MEMORY];   /* of the net on arrival at this node */
-    double rate[MHE_CHANNELS];   /* F of the stage that leaves this node */
-    double slope[MHE_CHANNELS];  /* 1 + dt dF/dtheta of that stage, direct part */
-    double tape[NET_TAPE];
+    real_t theta[MHE_CHANNELS];  /* the estimate at this node */
+    real_t u[2];                 /* [speed rpm, torque Nm] of the stage that leaves this node */
+    real_t y[MHE_CHANNELS];      /* measurement, offset removed */
+    real_t weight[MHE_CHANNELS]; /* Wy, or 0 where there is none */
+    real_t memory[NET_MEMORY];   /* of the net on arrival at this node */
+    real_t rate[MHE_CHANNELS];   /* F of the stage that leaves this node */
+    real_t slope[MHE_CHANNELS];  /* 1 + dt dF/dtheta of that stage, direct part */
+    real_t tape[NET_TAPE];
 } mhe_node_t;
 
 typedef struct {
-    double weight_measurement[MHE_CHANNELS];
-    double weight_noise[MHE_CHANNELS];
-    double weight_arrival[MHE_CHANNELS];
-    double weight_prior[MHE_CHANNELS];
-    double lower, upper, tolerance;
-    double loss_scale;           /* degC, of Huber's and Geman and McClure's loss */
+    real_t weight_measurement[MHE_CHANNELS];
+    real_t weight_noise[MHE_CHANNELS];
+    real_t weight_arrival[MHE_CHANNELS];
+    real_t weight_prior[MHE_CHANNELS];
+    real_t lower, upper, tolerance;
+    real_t loss_scale;           /* degC, of Huber's and Geman and McClure's loss */
     int loss;                    /* EST_LOSS_... of est_settings.h */
     int max_sweeps;
     bool newest_measurement;
@@ -55,13 +56,16 @@ typedef struct {
     int head;                    /* ring index of the oldest node */
     int count;                   /* nodes in the window, 0 before mhe_start() */
     bool full;                   /* the window has shifted at least once: arrival weight instead of prior weight */
-    double prior[MHE_CHANNELS];  /* theta bar of the oldest node */
+    bool stale;                  /* temperatures have moved since the stages were computed */
+    bool careful;                /* this solve keeps to the loss's majorant */
+    bool converged;              /* so far */
+    real_t prior[MHE_CHANNELS];  /* theta bar of the oldest node */
     box_qp_t qp[MHE_CHANNELS];
 } mhe_t;
 
 typedef struct {
-    double theta[MHE_CHANNELS]; /* at the newest node */
-    double kkt_degc;            /* largest change the last tridiagonal solve asked for: the KKT residual in degC */
+    real_t theta[MHE_CHANNELS]; /* at the newest node */
+    real_t kkt_degc;            /* largest change the last tridiagonal solve asked for: the KKT residual in degC */
     int sweeps;                 /* gradient sweeps done */
     int active;                 /* active-set changes, both channels, all sweeps; 0: no bound was met */
 } mhe_result_t;
@@ -70,35 +74,42 @@ typedef struct {
 void mhe_init(mhe_t *self, const est_setting_t *setting);
 
 /* Begin a window of one node with that prior and that memory of the net (NET_MEMORY). Never fails. */
-void mhe_start(mhe_t *self, const double prior[MHE_CHANNELS], const double memory[]);
+void mhe_start(mhe_t *self, const real_t prior[MHE_CHANNELS], const real_t memory[]);
 
 /* Append a node: the newest one plus one step of the net with u = [speed rpm, torque Nm]. A full window drops its oldest node; the prior becomes the last solution at the new oldest node, whose
  * memory is kept. One net step. */
-void mhe_advance(mhe_t *self, const double u[2]);
+void mhe_advance(mhe_t *self, const real_t u[2]);
 
 /* Another prior of the oldest node, and its weights (1/K^2), in place of the last solution there and the setting's; memory: of
  * the net there, NULL to keep it (else one forward pass). For a full window, after mhe_advance(). */
-void mhe_arrival(mhe_t *self, const double prior[MHE_CHANNELS], const double weight[MHE_CHANNELS], const double memory[]);
+void mhe_arrival(mhe_t *self, const real_t prior[MHE_CHANNELS], const real_t weight[MHE_CHANNELS], const real_t memory[]);
 
 /* Attach measurement y (offset removed) to the node `age` steps before the newest, with `share` (0..1) of the setting's
  * weight. Returns the innovation: y minus what the window said before; attaches nothing and returns NAN for a node
  * outside the window or a value that is not finite. */
-double mhe_measure(mhe_t *self, int age, int channel, double y, double share);
+real_t mhe_measure(mhe_t *self, int age, int channel, real_t y, real_t share);
 
 /* Take back the measurements of the newest `nodes` nodes: they turned out to be worth nothing. */
 void mhe_forget(mhe_t *self, int channel, int nodes);
 
 /* Move the whole window of one channel by `shift` degC: the level was wrong, the course was not. */
-void mhe_shift(mhe_t *self, int channel, double shift);
+void mhe_shift(mhe_t *self, int channel, real_t shift);
 
-/* Solve from the present window. Cost: (sweeps - 1) forward passes and `sweeps` adjoint passes over the window. */
+/* Solve from the present window: to the tolerance, or as many sweeps as allowed (a tolerance of 0 makes that a fixed
+ * number). Cost: (sweeps - 1) forward passes and `sweeps` adjoint passes over the window. The same as mhe_feedback() and mhe_finish() at once. */
 mhe_status_t mhe_solve(mhe_t *self, mhe_result_t *result);
+
+/* The estimate after the first sweep alone: one adjoint pass and one solve, no forward pass. MHE_MAX_SWEEPS: there is more to do,
+ * and mhe_finish() with the same result, after publishing, does it; it returns what mhe_solve() would have. Until then
+ * the memory in the window's nodes is that of before the sweep. */
+mhe_status_t mhe_feedback(mhe_t *self, mhe_result_t *result);
+mhe_status_t mhe_finish(mhe_t *self, mhe_result_t *result);
 
 /* The node `age` steps before the newest, NULL outside the window. The newest node's memory belongs to the solution. */
 const mhe_node_t *mhe_node(const mhe_t *self, int age);
 
 /* The cost at the present temperatures and its gradient (count rows of [winding, rotor], oldest first), bounds left
  * out; runs a forward and an adjoint pass. For tests. */
-double mhe_cost(mhe_t *self, double gradient[][MHE_CHANNELS]);
+real_t mhe_cost(mhe_t *self, real_t gradient[][MHE_CHANNELS]);
 
 #endif

@@ -1,13 +1,15 @@
-"""One net, four programs: torch, numpy, CasADi and the generated C agree to 1e-12 in double precision.
+"""One net, many programs: torch, numpy, CasADi and each kernel of the generated C agree to 1e-12 in double precision.
 
 For every kind of net the generator takes; its MHE against ipopt is in test_mhe_nets.py.
 """
 
 from __future__ import annotations
 
+import ctypes as ct
 import os
 import subprocess
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import casadi as ca
@@ -27,7 +29,7 @@ Sequence = Callable[[NetWeights, Path, np.ndarray], tuple[np.ndarray, np.ndarray
 
 
 NETS = {  # cell, layers, cells per layer
-    "lstm 4": ("lstm", 1, 4), "lstm 3": ("lstm", 1, 3), "lstm 16": ("lstm", 1, 16), "lstm 32": ("lstm", 1, 32),
+    "lstm 4": ("lstm", 1, 4), "lstm 3": ("lstm", 1, 3), "lstm 12": ("lstm", 1, 12), "lstm 16": ("lstm", 1, 16), "lstm 32": ("lstm", 1, 32),
     "lstm 2x8": ("lstm", 2, 8), "gru 8": ("gru", 1, 8), "gru 2x5": ("gru", 2, 5),
 }  # fmt: skip
 
@@ -75,8 +77,22 @@ def by_casadi(weights: NetWeights, path: Path, x: np.ndarray) -> tuple[np.ndarra
     return rates, memory[: weights.memory_c], memory[weights.memory_c :]
 
 
-def by_c(weights: NetWeights, path: Path, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+KERNELS = ("portable", "avx2", "avx512")
+
+
+def with_kernel(path: Path, kernel: str) -> Lib:
+    """The library of a net with that kernel chosen, or a skip that says so."""
     lib = Lib(compile_library(path))
+    lib.c.net_select.restype, lib.c.net_select.argtypes = ct.c_char_p, [ct.c_char_p]
+    chosen = lib.c.net_select(kernel.encode())
+    if chosen is None:
+        pytest.skip(f"this processor has no {kernel}: that kernel is NOT checked")
+    assert chosen.decode() == kernel
+    return lib
+
+
+def by_c(weights: NetWeights, path: Path, x: np.ndarray, kernel: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    lib = with_kernel(path, kernel)
     assert lib.sha256 == weights.sha256
     c, h = weights.empty_memory()
     rates = np.empty((len(x), 2))
@@ -85,7 +101,12 @@ def by_c(weights: NetWeights, path: Path, x: np.ndarray) -> tuple[np.ndarray, np
     return rates, c, h
 
 
-@pytest.mark.parametrize("program", [by_torch, by_casadi, by_c])
+PROGRAMS: dict[str, Sequence] = {
+    "torch": by_torch, "casadi": by_casadi, **{f"C {kernel}": partial(by_c, kernel=kernel) for kernel in KERNELS},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("program", PROGRAMS.values(), ids=PROGRAMS)
 def test_equals_numpy(program: Sequence, net_path: Path) -> None:
     weights, x = load_weights(net_path), drive()
     expected = lstm_sequence(weights, x)
@@ -102,10 +123,11 @@ def operating_point(weights: NetWeights, seed: int) -> tuple[np.ndarray, np.ndar
     return drive(1, seed + 100)[0], c, h
 
 
+@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("seed", range(3))
-def test_adjoint_in_c_equals_casadis_derivative(net_path: Path, seed: int) -> None:
+def test_adjoint_in_c_equals_casadis_derivative(net_path: Path, seed: int, kernel: str) -> None:
     weights = load_weights(net_path)
-    net, lib, n_m = build_net(weights), Lib(compile_library(net_path)), weights.memory
+    net, lib, n_m = build_net(weights), with_kernel(net_path, kernel), weights.memory
     x, c, h = operating_point(weights, seed)
     rng = np.random.default_rng(seed)
     bars = [rng.normal(size=size) for size in (2, n_m)]
@@ -121,9 +143,10 @@ def test_adjoint_in_c_equals_casadis_derivative(net_path: Path, seed: int) -> No
         np.testing.assert_allclose(found, np.array(wanted).ravel(), rtol=0, atol=TOLERANCE)
 
 
-def test_slope_in_c_equals_casadis_derivative(net_path: Path) -> None:
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_slope_in_c_equals_casadis_derivative(net_path: Path, kernel: str) -> None:
     weights = load_weights(net_path)
-    net, lib = build_net(weights), Lib(compile_library(net_path))
+    net, lib = build_net(weights), with_kernel(net_path, kernel)
     x, c, h = operating_point(weights, 5)
     memory = np.concatenate([c, h])
     sym = [ca.SX.sym(name, size) for name, size in (("u", 2), ("t", 2), ("m", weights.memory))]
@@ -136,15 +159,16 @@ def test_generated_c_is_clean(net_path: Path, tmp_path: Path) -> None:
     generate(net_path, SETTINGS, tmp_path)
     strict = ["-std=c11", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror"]
     base = ROOT / "estimator_c" / "src"
-    for source in (tmp_path / "thermal_net.c", tmp_path / "train_envelope.c", base / "mhe.c", base / "estimator.c"):
+    for source in (*sorted(tmp_path.glob("*.c")), base / "mhe.c", base / "estimator.c"):
         includes = [f"-I{base}", f"-I{base / 'solver'}", f"-I{tmp_path}"]
-        subprocess.run(["gcc", *strict, *includes, "-fsyntax-only", str(source)], check=True)
+        subprocess.run(["gcc", *strict, *includes, "-O1", "-c", "-o", str(tmp_path / "object.o"), str(source)], check=True)
 
 
+@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("cell", ["lstm", "gru"])
-def test_saturated_gates_stay_finite(cell: str, tmp_path: Path) -> None:
+def test_saturated_gates_stay_finite(cell: str, kernel: str, tmp_path: Path) -> None:
     """Weights far beyond training drive every exp to its limits; the C must give numpy's 0 and 1, not NaN."""
     path = random_net(tmp_path, seed=1, gain=2000.0, cell=cell)
     weights, x = load_weights(path), drive(50)
-    rates, _, _ = by_c(weights, path, x)
+    rates, _, _ = by_c(weights, path, x, kernel)
     np.testing.assert_allclose(rates, lstm_sequence(weights, x)[0], rtol=0, atol=TOLERANCE)

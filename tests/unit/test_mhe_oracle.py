@@ -21,7 +21,7 @@ from tests.support.libest import NODES, WEIGHTS, Lib, Mhe, compile_library
 from tests.support.mhe_recorder import Record, Recorder, record
 
 AGREEMENT_DEGC = 1e-6
-TIGHT = {"tolerance_degc": 1e-9, "max_sweeps": 60}
+TIGHT = {"tolerance_degc": 1e-9, "max_sweeps": 60, "loss": 0}  # the quadratic loss: the robust ones are in test_mhe_robust.py
 
 
 @cache
@@ -183,7 +183,7 @@ def test_default_setting_converges_in_few_sweeps() -> None:
         assert status == 0
         assert result.kkt_degc <= run.setting.tolerance_degc
         sweeps.append(result.sweeps)
-    assert max(sweeps) <= 6
+    assert max(sweeps) <= 5
 
 
 def test_state_size_is_what_the_header_says(tmp_path: Path) -> None:
@@ -198,8 +198,8 @@ def test_state_size_is_what_the_header_says(tmp_path: Path) -> None:
     )
     out = subprocess.run([str(tmp_path / "size")], capture_output=True, text=True, check=True).stdout
     mhe_bytes, estimator_bytes = map(int, out.split())
-    assert mhe_bytes <= 11_000 <= Mhe.SIZE
-    assert estimator_bytes <= 18_500
+    assert mhe_bytes <= 16_384 <= Mhe.SIZE
+    assert estimator_bytes <= 40_000
 
 
 class BoxQp(ct.Structure):

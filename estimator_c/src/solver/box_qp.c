@@ -9,17 +9,17 @@ void box_qp_factor(box_qp_t *self)
     tridiag_factor(&self->factor, self->n, self->diag, self->off);
 }
 
-static side_t side_of(double x, double lower, double upper)
+static side_t side_of(real_t x, real_t lower, real_t upper)
 {
     return x > upper ? AT_UPPER : x < lower ? AT_LOWER : FREE;
 }
 
 /* Solve with the nodes of `side` held at (hard) or pulled to (soft) their bounds. */
-static void solve_with_sides(const box_qp_t *self, const side_t side[], double x[])
+static void solve_with_sides(const box_qp_t *self, const side_t side[], real_t x[])
 {
-    double diag[TRIDIAG_MAX];
-    double off[TRIDIAG_MAX];
-    double rhs[TRIDIAG_MAX];
+    real_t diag[TRIDIAG_MAX];
+    real_t off[TRIDIAG_MAX];
+    real_t rhs[TRIDIAG_MAX];
     const int n = self->n;
 
     for (int k = 0; k < n; k++) {
@@ -31,26 +31,26 @@ static void solve_with_sides(const box_qp_t *self, const side_t side[], double x
         if (side[k] == FREE) {
             continue;
         }
-        const double bound = side[k] == AT_UPPER ? self->upper[k] : self->lower[k];
+        const real_t bound = side[k] == AT_UPPER ? self->upper[k] : self->lower[k];
         if (!self->hard) {
             diag[k] += self->rho;
             rhs[k] += self->rho * bound;
             continue;
         }
         /* Row k becomes x_k = bound; its neighbours keep symmetry by moving the known term to the right. */
-        diag[k] = 1.0;
+        diag[k] = 1;
         rhs[k] = bound;
         if (k > 0) {
             if (side[k - 1] == FREE) {
                 rhs[k - 1] -= off[k - 1] * bound;
             }
-            off[k - 1] = 0.0;
+            off[k - 1] = 0;
         }
         if (k + 1 < n) {
             if (side[k + 1] == FREE) {
                 rhs[k + 1] -= off[k] * bound;
             }
-            off[k] = 0.0;
+            off[k] = 0;
         }
     }
     tridiag_t factor;
@@ -59,9 +59,9 @@ static void solve_with_sides(const box_qp_t *self, const side_t side[], double x
 }
 
 /* Multiplier of node k: minus the gradient of the objective, positive when the objective pushes upwards. */
-static double push_of(const box_qp_t *self, const double x[], int k)
+static real_t push_of(const box_qp_t *self, const real_t x[], int k)
 {
-    double push = -self->gradient[k] - self->diag[k] * x[k];
+    real_t push = -self->gradient[k] - self->diag[k] * x[k];
     if (k > 0) {
         push -= self->off[k - 1] * x[k - 1];
     }
@@ -71,7 +71,7 @@ static double push_of(const box_qp_t *self, const double x[], int k)
     return push;
 }
 
-int box_qp_solve(const box_qp_t *self, double x[])
+int box_qp_solve(const box_qp_t *self, real_t x[])
 {
     const int n = self->n;
     side_t side[TRIDIAG_MAX];
@@ -94,7 +94,7 @@ int box_qp_solve(const box_qp_t *self, double x[])
         for (int k = 0; k < n; k++) {
             side_t next = side_of(x[k], self->lower[k], self->upper[k]);
             if (self->hard && side[k] != FREE) {
-                next = push_of(self, x, k) * (double)side[k] > 0.0 ? side[k] : FREE;
+                next = push_of(self, x, k) * (real_t)side[k] > 0 ? side[k] : FREE;
             }
             settled &= next == side[k];
             side[k] = next;

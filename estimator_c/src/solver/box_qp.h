@@ -14,13 +14,13 @@
 
 typedef struct {
     int n;                    /* 1..TRIDIAG_MAX */
-    double diag[TRIDIAG_MAX];
-    double off[TRIDIAG_MAX];  /* off[k] = A(k, k+1) <= 0 */
-    double gradient[TRIDIAG_MAX];
-    double lower[TRIDIAG_MAX];
-    double upper[TRIDIAG_MAX];
+    real_t diag[TRIDIAG_MAX];
+    real_t off[TRIDIAG_MAX];  /* off[k] = A(k, k+1) <= 0 */
+    real_t gradient[TRIDIAG_MAX];
+    real_t lower[TRIDIAG_MAX];
+    real_t upper[TRIDIAG_MAX];
     bool hard;
-    double rho;               /* soft: weight of the penalty */
+    real_t rho;               /* soft: weight of the penalty */
     tridiag_t factor;         /* of diag, off: box_qp_factor() */
 } box_qp_t;
 
@@ -29,6 +29,6 @@ void box_qp_factor(box_qp_t *self);
 
 /* Solve for x. Returns the number of active-set changes (0: no bound met), or -1 when the sets did not settle within
  * BOX_QP_MAX_CHANGES; x is then clipped (hard) or the last iterate (soft). */
-int box_qp_solve(const box_qp_t *self, double x[]);
+int box_qp_solve(const box_qp_t *self, real_t x[]);
 
 #endif

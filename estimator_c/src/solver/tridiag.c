@@ -1,17 +1,17 @@
 #include "tridiag.h"
 
-void tridiag_factor(tridiag_t *self, int n, const double diag[], const double off[])
+void tridiag_factor(tridiag_t *self, int n, const real_t diag[], const real_t off[])
 {
-    double pivot = diag[0];
-    self->inverse[0] = 1.0 / pivot;
+    real_t pivot = diag[0];
+    self->inverse[0] = 1 / pivot;
     for (int k = 0; k + 1 < n; k++) {
         self->lower[k] = off[k] * self->inverse[k];
         pivot = diag[k + 1] - self->lower[k] * off[k];
-        self->inverse[k + 1] = 1.0 / pivot;
+        self->inverse[k + 1] = 1 / pivot;
     }
 }
 
-void tridiag_solve(const tridiag_t *self, int n, const double b[], double x[])
+void tridiag_solve(const tridiag_t *self, int n, const real_t b[], real_t x[])
 {
     x[0] = b[0];
     for (int k = 1; k < n; k++) {
