@@ -89,6 +89,17 @@ void fusion_advance(fusion_t *self, const double u[2])
     slow_observer_predict(&self->slow, u);
 }
 
+/* The loss bends where values are out of the ordinary, and with a noisy sensor the ordinary is wider. */
+static void set_loss_scale(fusion_t *self)
+{
+    double wider = 1.0;
+    for (int ch = 0; ch < MHE_CHANNELS && self->setting.supervise; ch++) {
+        const sensor_monitor_t *monitor = &self->monitor[ch];
+        wider = fmax(wider, monitor->spread_r / monitor->r);
+    }
+    self->mhe.loss_scale = self->setting.loss_scale_degc * sqrt(wider);
+}
+
 void fusion_doubt(fusion_t *self, double novelty)
 {
     if (!(novelty > 1.0)) { /* NAN where the weights carry no envelope */
@@ -200,6 +211,7 @@ void fusion_solve(fusion_t *self, fusion_estimate_t *estimate)
     *estimate = (fusion_estimate_t){.status = MHE_OK};
     bool solved = false;
     if (uses_mhe(self)) {
+        set_loss_scale(self);
         estimate->status = mhe_solve(&self->mhe, &result);
         solved = estimate->status == MHE_OK ||
                  (estimate->status == MHE_MAX_SWEEPS && result.kkt_degc < USABLE_KKT_DEGC);
