@@ -75,7 +75,7 @@ def real_header(real: Real, banner: str) -> str:
 #ifndef REAL_H
 #define REAL_H
 
-#include <math.h> /* what compilers know themselves, fabs() and NAN; nothing of libm is called */
+#include <math.h> /* fabs() and NAN: nothing of libm is called */
 #include <stdbool.h>
 #include <stdint.h>
 #include <string.h>
@@ -86,7 +86,7 @@ typedef {real.c_type} real_t;
 
 static inline real_t real_abs(real_t x)
 {{
-    return x > -x ? x : -x;
+    return fabs{real.suffix}(x); /* compilers have it themselves */
 }}
 
 /* The larger; b where a is not a number. */

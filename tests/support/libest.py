@@ -18,7 +18,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = ("mhe", "ekf", "slow_observer", "sensor_monitor", "fusion", "offset_calibration", "estimator", "validity")
-SOURCES = (*(f"src/{name}.c" for name in CORE), "src/est_batch.c", "src/solver/tridiag.c", "src/solver/box_qp.c")
+SOURCES = (*(f"src/{name}.c" for name in CORE), "src/est_batch.c", "src/solver/tridiag.c", "src/solver/tridiag_pair.c", "src/solver/box_qp.c")
 SETTINGS = ROOT / "estimator_c" / "settings"
 WEIGHTS = ROOT / "estimator_c" / "weights" / "lstm8.json"
 NODES = 16
