@@ -101,7 +101,8 @@ static inline bool real_finite(real_t x)
 }}
 
 /* a[k] = 1/(1 + exp(a[k])) for n gates: a sigmoid of -a, and tanh(a/2) = 1 - 2/(1 + exp(a)). Absolute error of either
- * <= {GATE_ERROR[real.c_type]} for |a| < {DOMAIN[real.c_type]}, 0 and 1 within 2^-{LIMIT} where the power is held there; not finite gives NaN. */
+ * <= {GATE_ERROR[real.c_type]} for |a| < {DOMAIN[real.c_type]}, 0 and 1 within 2^-{LIMIT} where the power is held there; NaN gives NaN,
+ * an infinite a its end or NaN. */
 static inline void net_gates(real_t a[], int n)
 {{
     const real_t shift = {real.literal(shift)}; /* adding it rounds to a whole number, which its last bits then show */
