@@ -1,6 +1,7 @@
-/* One figure per step of the estimator: bench_mhe MODE MAX_SWEEPS < rows
+/* One figure per step of the estimator: bench_mhe MODE MAX_SWEEPS [KERNEL] < rows
  * rows: float64 [speed rpm, torque Nm, winding, rotor (offset removed)] at 10 Hz. MODE mhe: advance + measure + solve;
- * core: an interval's ten motor frames, its temperature frame and estimator_step(). MAX_SWEEPS 0: the setting's.
+ * core: an interval's ten motor frames, its temperature frame and estimator_step(). MAX_SWEEPS 0: the setting's. KERNEL: of
+ * the net, the best there is if none is named.
  * Prints "steps median_us p99_us sweeps_mean". Instructions: callgrind with --toggle-collect=timed_step. */
 #include <stdio.h>
 #include <stdlib.h>
@@ -49,7 +50,7 @@ static int ascending(const void *a, const void *b)
 
 int main(int argc, char **argv)
 {
-    if (argc < 3) {
+    if (argc < 3 || (argc > 3 && net_select(argv[3]) == NULL)) {
         return 2;
     }
     const int mode = strcmp(argv[1], "core") == 0;

@@ -4,7 +4,7 @@
 
 Data: the plant's lap from second 400 with the sensor's noise. `mhe`: append a node, measure, solve. `core`: ten motor
 frames, a temperature frame and estimator_step() with its 15-step prediction. The fixed sweep counts show the price of
-a sweep; "converged" is the default setting. Needs gcc; valgrind for the instruction counts.
+a sweep; "converged" is the default setting. All with the portable kernel of the net. Needs gcc; valgrind for the instruction counts.
 """
 
 from __future__ import annotations
@@ -62,9 +62,11 @@ def build(weights: Path, folder: Path, source: str = "bench_mhe.c") -> Path:
     return program
 
 
-def measure(program: Path, rows: np.ndarray, mode: str, max_sweeps: int, folder: Path) -> Cost:
-    """Time the whole record; count instructions over its first 300 steps."""
-    command = [str(program), mode, str(max_sweeps)]
+def measure(
+    program: Path, rows: np.ndarray, mode: str, max_sweeps: int, folder: Path, kernel: str = "portable"
+) -> Cost:
+    """Time the whole record with that kernel of the net; count instructions over its first 300 steps."""
+    command = [str(program), mode, str(max_sweeps), kernel]
     done = subprocess.run(command, input=rows.tobytes(), capture_output=True, check=True)
     _, median_us, p99_us, sweeps = (float(word) for word in done.stdout.split())
     instructions = None

@@ -28,9 +28,9 @@ from tests.support.libest import WEIGHTS
 from tools.files import write_json, write_whole
 from tools.solver_backends import table
 from tools.solver_backends.build import BuildError
-from tools.solver_backends.configs import REFERENCE, Config, UnknownBackend, chosen
+from tools.solver_backends.configs import HPIPM, REFERENCE, Config, UnknownBackend, chosen
 from tools.solver_backends.figures import Figures, Measured, best_hpipm, by_name, document, figures_of, oracle_figures
-from tools.solver_backends.measure import Bench, MeasureError, pinned_core
+from tools.solver_backends.measure import MHE_PARTS, Bench, MeasureError, counted_steps, pinned_core
 from tools.solver_backends.oracle import NODES, Answers
 from tools.solver_backends.stream import Segment, record_all, shortened
 
@@ -92,13 +92,14 @@ def bench(
     kinds = kinds_of(segments)
     ran = [machine.configs[place] for place in places]
     figures = [
-        figures_of(measured, at, answers, kinds, config.chief or (config.sweeps == 0 and config.loss < 0))
-        for at, config in enumerate(ran)
+        figures_of(measured, at, answers, kinds, config.converges) for at, config in enumerate(ran)
     ]
     if not args.no_count:
         say("instructions …")
         for at, place in enumerate(places[1:], start=1):
             figures[at]["instructions"] = machine.count(place, segments)
+            if machine.configs[place].library != HPIPM:
+                figures[at]["instructions_mhe"] = machine.count(place, segments, MHE_PARTS)
     found = by_name(ran[1:], figures[1:])
     if with_oracle and took_us:
         found["oracle"] = oracle_figures(took_us)
@@ -109,7 +110,7 @@ def bench(
         f"run forward through the delay, part of every step: median {min(f['ahead_median_us'] for f in figures):.1f} µs "
         "at best",
     ]
-    notes += [] if args.no_count else [KERNEL_NOTE.format(steps=_counted(segments))]
+    notes += [] if args.no_count else [KERNEL_NOTE.format(steps=counted_steps(segments))]
     notes += [f"not on this machine: {', '.join(absent)}"] if absent else []
     return found, notes
 
@@ -129,12 +130,6 @@ def ask_oracle(measured: Measured, answers: Answers) -> tuple[dict[int, NDArray[
 def kinds_of(segments: Sequence[Segment]) -> NDArray[np.str_]:
     """Group of every step."""
     return np.repeat([s.situation.kind for s in segments], [len(s) for s in segments])
-
-
-def _counted(segments: Sequence[Segment]) -> int:
-    from tools.solver_backends.measure import COUNTED, COUNTED_FROM, COUNTED_TO
-
-    return sum(max(0, min(len(s), COUNTED_TO) - COUNTED_FROM) for s in segments if s.situation.name in COUNTED)
 
 
 def _processor() -> str:

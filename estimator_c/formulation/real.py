@@ -75,7 +75,7 @@ def real_header(real: Real, banner: str) -> str:
 #ifndef REAL_H
 #define REAL_H
 
-#include <math.h> /* what compilers know themselves, fabs() and NAN; nothing of libm is called */
+#include <math.h> /* fabs() and NAN: nothing of libm is called */
 #include <stdbool.h>
 #include <stdint.h>
 #include <string.h>
@@ -86,7 +86,7 @@ typedef {real.c_type} real_t;
 
 static inline real_t real_abs(real_t x)
 {{
-    return x > -x ? x : -x;
+    return fabs{real.suffix}(x); /* compilers have it themselves */
 }}
 
 /* The larger; b where a is not a number. */
@@ -101,7 +101,8 @@ static inline bool real_finite(real_t x)
 }}
 
 /* a[k] = 1/(1 + exp(a[k])) for n gates: a sigmoid of -a, and tanh(a/2) = 1 - 2/(1 + exp(a)). Absolute error of either
- * <= {GATE_ERROR[real.c_type]} for |a| < {DOMAIN[real.c_type]}, 0 and 1 within 2^-{LIMIT} where the power is held there; not finite gives NaN. */
+ * <= {GATE_ERROR[real.c_type]} for |a| < {DOMAIN[real.c_type]}, 0 and 1 within 2^-{LIMIT} where the power is held there; NaN gives NaN,
+ * an infinite a its end or NaN. */
 static inline void net_gates(real_t a[], int n)
 {{
     const real_t shift = {real.literal(shift)}; /* adding it rounds to a whole number, which its last bits then show */

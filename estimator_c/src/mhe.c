@@ -33,11 +33,11 @@ void mhe_init(mhe_t *self, const est_setting_t *setting)
         self->weight_noise[ch] = (real_t)setting->weight_noise[ch];
         self->weight_arrival[ch] = (real_t)setting->weight_arrival[ch];
         self->weight_prior[ch] = (real_t)setting->weight_prior[ch];
-        self->qp[ch].hard = setting->hard_bounds;
-        self->qp[ch].rho = (real_t)setting->bound_weight;
     }
     self->loss = setting->loss;
     self->loss_scale = (real_t)setting->loss_scale_degc;
+    self->hard_bounds = setting->hard_bounds;
+    self->bound_weight = (real_t)setting->bound_weight;
     self->lower = (real_t)setting->lower_degc;
     self->upper = (real_t)setting->upper_degc;
     self->tolerance = real_max((real_t)setting->tolerance_degc, TOLERANCE_FLOOR_DEGC);
@@ -65,7 +65,7 @@ static void stage_forward(mhe_t *self, int k)
 {
     mhe_node_t *from = at(self, k);
     mhe_node_t *to = at(self, k + 1);
-    net_forward(from->u, from->theta, from->memory, to->memory, from->rate, from->tape);
+    net_kernel->forward(from->u, from->theta, from->memory, to->memory, from->rate, from->tape);
 }
 
 static void forward_sweep(mhe_t *self)
@@ -90,7 +90,7 @@ static void stage_slope(mhe_t *self, int k)
 {
     mhe_node_t *from = at(self, k);
     real_t slope[MHE_CHANNELS];
-    net_slope(from->tape, from->memory, slope);
+    net_kernel->slope(from->tape, from->memory, slope);
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         from->slope[ch] = real_max(1 + NET_DT_S * slope[ch], (real_t)0.1);
     }
@@ -166,30 +166,47 @@ const mhe_node_t *mhe_node(const mhe_t *self, int age)
     return &self->node[(self->head + self->count - 1 - age) & (MHE_NODES - 1)];
 }
 
-/* Weight of residual r under the loss: the derivative of rho over r. 1 where r is small; Huber 1965, Geman and McClure 1987. */
-static real_t loss_weight(const mhe_t *self, real_t r)
-{
-    const real_t x = r / self->loss_scale;
-    if (self->loss == EST_LOSS_GEMAN_MCCLURE) {
-        const real_t d = 1 / (1 + x * x);
-        return d * d;
-    }
-    return self->loss == EST_LOSS_HUBER ? 1 / real_max(real_abs(x), 1) : 1;
-}
+/* What the loss does with the residuals of a window: factors on the measurement's weight. */
+typedef struct {
+    real_pair_t residual[MHE_NODES]; /* degC, theta minus y */
+    real_pair_t pull[MHE_NODES];     /* in the gradient: the derivative of rho over the residual */
+    real_pair_t curvature[MHE_NODES]; /* in the matrix */
+} losses_t;
 
-/* What residual r adds to the matrix. `careful`: the weight, a parabola above the loss that touches it, so that no step can
- * climb. Else the loss's own curvature, which ends in fewer sweeps, where that is not negative. */
-static real_t loss_curvature(const mhe_t *self, real_t r, bool careful)
+/* Huber 1965, Geman and McClure 1987. The curvature: with `careful` the same as the pull, a parabola above the loss that
+ * touches it, so that no step can climb; else the loss's own curvature, which ends in fewer sweeps, where that is not
+ * negative. All nodes of the ring, in use or not: a loop of known length is computed two numbers at a time. */
+static void weigh(const mhe_t *self, bool careful, losses_t *out)
 {
-    if (careful) {
-        return loss_weight(self, r);
+    const real_t per_scale = 1 / self->loss_scale;
+    for (int k = 0; k < MHE_NODES; k++) {
+        const mhe_node_t *node = &self->node[(self->head + k) & (MHE_NODES - 1)];
+        for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+            out->residual[k][ch] = node->theta[ch] - node->y[ch];
+            out->pull[k][ch] = 1;
+            out->curvature[k][ch] = 1;
+        }
     }
-    const real_t x = r / self->loss_scale;
     if (self->loss == EST_LOSS_GEMAN_MCCLURE) {
-        const real_t d = 1 / (1 + x * x);
-        return real_max((1 - 3 * x * x) * d * d * d, 0);
+        for (int k = 0; k < MHE_NODES; k++) {
+            for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+                const real_t x = out->residual[k][ch] * per_scale;
+                const real_t d = 1 / (1 + x * x);
+                const real_t own = (1 - 3 * x * x) * d; /* times the pull */
+                const real_t kept = (own + real_abs(own)) * (real_t)0.5;
+                out->pull[k][ch] = d * d;
+                out->curvature[k][ch] = d * d * (careful ? 1 : kept);
+            }
+        }
+    } else if (self->loss == EST_LOSS_HUBER) {
+        for (int k = 0; k < MHE_NODES; k++) {
+            for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+                const real_t x = real_abs(out->residual[k][ch] * per_scale);
+                out->pull[k][ch] = 1 / real_max(x, 1);
+                out->curvature[k][ch] = careful ? out->pull[k][ch] : x > 1 ? 0 : 1;
+            }
+        }
     }
-    return self->loss == EST_LOSS_HUBER && real_abs(x) > 1 ? 0 : 1;
 }
 
 /* The loss itself over its scale squared is rho(x); here times the scale squared, 1/2 r^2 where r is small. */
@@ -204,76 +221,117 @@ static real_t loss_value(const mhe_t *self, real_t r)
     return self->loss == EST_LOSS_HUBER && x > 1 ? s * s * (x - half) : half * r * r;
 }
 
-/* Gradient of the cost at the point of the last forward sweep, into qp[].gradient. */
-static void adjoint_sweep(mhe_t *self)
+/* Gradient of the cost at the point of the last forward sweep. */
+static void adjoint_sweep(mhe_t *self, const losses_t *losses)
 {
     const real_t *p0 = arrival_weight(self);
-    real_t memory_bar[NET_MEMORY] = {0};
-    real_t pull[MHE_CHANNELS] = {0}; /* Ww w of the stage that leaves node k + 1 -> seen from its arrival side */
+    const int last = self->count - 1;
+    real_pair_t rate_bar[MHE_NODES];
+    NET_ALIGNED real_t memory_bar[NET_MEMORY] = {0};
 
-    for (int k = self->count - 1; k >= 0; k--) {
-        mhe_node_t *node = at(self, k);
-        real_t theta_bar[MHE_CHANNELS] = {0};
-        if (k + 1 < self->count) {
-            const mhe_node_t *to = at(self, k + 1);
-            real_t rate_bar[MHE_CHANNELS];
-            for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-                const real_t w = to->theta[ch] - node->theta[ch] - NET_DT_S * node->rate[ch];
-                pull[ch] = self->weight_noise[ch] * w;
-                self->qp[ch].gradient[k + 1] += pull[ch];
-                rate_bar[ch] = -NET_DT_S * pull[ch];
-            }
-            net_adjoint(node->tape, node->memory, rate_bar, memory_bar, theta_bar, memory_bar);
-        }
+    /* What needs no net: measurements and prior, then the noise between each two nodes. */
+    for (int k = 0; k <= last; k++) {
         for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-            const real_t residual = node->theta[ch] - node->y[ch];
-            self->qp[ch].gradient[k] =
-                theta_bar[ch] - pull[ch] + weight_at(self, k, ch) * loss_weight(self, residual) * residual;
+            self->gradient[k][ch] = weight_at(self, k, ch) * losses->pull[k][ch] * losses->residual[k][ch];
         }
     }
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-        self->qp[ch].gradient[0] += p0[ch] * (at(self, 0)->theta[ch] - self->prior[ch]);
+        self->gradient[0][ch] += p0[ch] * (at(self, 0)->theta[ch] - self->prior[ch]);
+    }
+    for (int k = 0; k < last; k++) {
+        const mhe_node_t *from = at(self, k);
+        const mhe_node_t *to = at(self, k + 1);
+        for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+            const real_t w = to->theta[ch] - from->theta[ch] - NET_DT_S * from->rate[ch];
+            const real_t pull = self->weight_noise[ch] * w;
+            self->gradient[k][ch] -= pull;
+            self->gradient[k + 1][ch] += pull;
+            rate_bar[k][ch] = -NET_DT_S * pull;
+        }
+    }
+    const net_kernel_t *net = net_kernel;
+    for (int k = last - 1; k >= 0; k--) {
+        const mhe_node_t *from = at(self, k);
+        real_t theta_bar[MHE_CHANNELS];
+        net->adjoint(from->tape, from->memory, rate_bar[k], memory_bar, theta_bar, memory_bar);
+        for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+            self->gradient[k][ch] += theta_bar[ch];
+        }
     }
 }
 
 /* Gauss-Newton matrix of each channel with the direct slope of each stage; constant within a step unless the loss weighs
  * the residuals anew. */
-static void factor(mhe_t *self, bool careful)
+static void factor(mhe_t *self, const losses_t *losses)
 {
     const real_t *p0 = arrival_weight(self);
-    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-        box_qp_t *qp = &self->qp[ch];
-        const real_t ww = self->weight_noise[ch];
-        qp->n = self->count;
-        for (int k = 0; k < self->count; k++) {
+    const int last = self->count - 1;
+    for (int k = 0; k <= last; k++) {
+        for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+            const real_t ww = self->weight_noise[ch];
             const real_t a = at(self, k)->slope[ch];
-            const real_t leaving = k + 1 < self->count ? ww * a * a : 0;
-            const real_t arriving = k > 0 ? ww : p0[ch];
-            const real_t residual = at(self, k)->theta[ch] - at(self, k)->y[ch];
-            qp->diag[k] = arriving + leaving + weight_at(self, k, ch) * loss_curvature(self, residual, careful);
-            qp->off[k] = -ww * a;
+            self->diag[k][ch] = weight_at(self, k, ch) * losses->curvature[k][ch] + (ww + ww * a * a);
+            self->off[k][ch] = -ww * a;
         }
-        box_qp_factor(qp);
+    }
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) { /* no stage before the first node, none after the last */
+        const real_t a = at(self, last)->slope[ch];
+        self->diag[last][ch] -= self->weight_noise[ch] * a * a;
+        self->diag[0][ch] += p0[ch] - self->weight_noise[ch];
+    }
+    tridiag_pair_factor(&self->factor, self->count, (const real_pair_t *)self->diag, (const real_pair_t *)self->off);
+}
+
+/* The step of a channel that would leave the bounds: with them. */
+static void bounded_step(mhe_t *self, int ch, real_pair_t step[], int *active, bool *settled)
+{
+    box_qp_t qp = {.n = self->count, .hard = self->hard_bounds, .rho = self->bound_weight};
+    real_t x[MHE_NODES];
+    for (int k = 0; k < self->count; k++) {
+        qp.diag[k] = self->diag[k][ch];
+        qp.off[k] = self->off[k][ch];
+        qp.gradient[k] = self->gradient[k][ch];
+        qp.lower[k] = self->lower - at(self, k)->theta[ch];
+        qp.upper[k] = self->upper - at(self, k)->theta[ch];
+    }
+    box_qp_factor(&qp);
+    const int changes = box_qp_solve(&qp, x);
+    *settled = *settled && changes >= 0;
+    *active += changes > 0 ? changes : 0;
+    for (int k = 0; k < self->count; k++) {
+        step[k][ch] = x[k];
     }
 }
 
 /* Solve both channels for the change of temperature; returns its largest element, NAN if one is not finite. */
-static real_t tridiagonal_step(mhe_t *self, real_t step[MHE_CHANNELS][MHE_NODES], int *active, bool *settled)
+static real_t tridiagonal_step(mhe_t *self, real_pair_t step[], int *active, bool *settled)
 {
     real_t largest = 0;
     real_t sum = 0; /* real_max() drops a NaN, a sum does not */
-    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-        box_qp_t *qp = &self->qp[ch];
-        for (int k = 0; k < self->count; k++) {
-            qp->lower[k] = self->lower - at(self, k)->theta[ch];
-            qp->upper[k] = self->upper - at(self, k)->theta[ch];
+    real_pair_t highest = {self->lower, self->lower};
+    real_pair_t lowest = {self->upper, self->upper};
+    for (int k = 0; k < self->count; k++) {
+        for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+            step[k][ch] = -self->gradient[k][ch];
         }
-        const int changes = box_qp_solve(qp, step[ch]);
-        *settled = *settled && changes >= 0;
-        *active += changes > 0 ? changes : 0;
-        for (int k = 0; k < self->count; k++) {
-            largest = real_max(real_abs(step[ch][k]), largest);
-            sum += step[ch][k];
+    }
+    tridiag_pair_solve(&self->factor, self->count, (const real_pair_t *)step, step);
+    for (int k = 0; k < self->count; k++) {
+        for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+            const real_t theta = at(self, k)->theta[ch] + step[k][ch];
+            highest[ch] = real_max(theta, highest[ch]);
+            lowest[ch] = -real_max(-theta, -lowest[ch]);
+        }
+    }
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        if (highest[ch] > self->upper || lowest[ch] < self->lower) {
+            bounded_step(self, ch, step, active, settled);
+        }
+    }
+    for (int k = 0; k < self->count; k++) {
+        for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+            largest = real_max(real_abs(step[k][ch]), largest);
+            sum += step[k][ch];
         }
     }
     return real_finite(sum) ? largest : (real_t)NAN;
@@ -282,13 +340,15 @@ static real_t tridiagonal_step(mhe_t *self, real_t step[MHE_CHANNELS][MHE_NODES]
 /* One sweep from up-to-date stages: where the next solve would go, and there unless the tolerance is met. */
 static void sweep(mhe_t *self, mhe_result_t *result)
 {
-    real_t step[MHE_CHANNELS][MHE_NODES];
+    real_pair_t step[MHE_NODES];
+    losses_t losses;
     const real_t before = result->kkt_degc;
     bool settled = true;
+    weigh(self, self->careful, &losses);
     if (result->sweeps == 0 || self->loss != EST_LOSS_QUADRATIC) {
-        factor(self, self->careful);
+        factor(self, &losses);
     }
-    adjoint_sweep(self);
+    adjoint_sweep(self, &losses);
     result->kkt_degc = tridiagonal_step(self, step, &result->active, &settled);
     result->sweeps++;
     self->careful = self->careful || (result->sweeps > 1 && !(result->kkt_degc < SHRINK * before));
@@ -296,9 +356,9 @@ static void sweep(mhe_t *self, mhe_result_t *result)
     if (self->converged) {
         return;
     }
-    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-        for (int k = 0; k < self->count; k++) {
-            at(self, k)->theta[ch] += step[ch][k];
+    for (int k = 0; k < self->count; k++) {
+        for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+            at(self, k)->theta[ch] += step[k][ch];
         }
     }
     self->stale = true;
@@ -356,8 +416,10 @@ real_t mhe_cost(mhe_t *self, real_t gradient[][MHE_CHANNELS])
     const real_t half = (real_t)0.5;
     const real_t *p0 = arrival_weight(self);
     real_t cost = 0;
+    losses_t losses;
     forward_sweep(self);
-    adjoint_sweep(self);
+    weigh(self, true, &losses);
+    adjoint_sweep(self, &losses);
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         const real_t from_prior = at(self, 0)->theta[ch] - self->prior[ch];
         cost += half * p0[ch] * from_prior * from_prior;
@@ -369,7 +431,7 @@ real_t mhe_cost(mhe_t *self, real_t gradient[][MHE_CHANNELS])
                 const real_t w = at(self, k + 1)->theta[ch] - node->theta[ch] - NET_DT_S * node->rate[ch];
                 cost += half * self->weight_noise[ch] * w * w;
             }
-            gradient[k][ch] = self->qp[ch].gradient[k];
+            gradient[k][ch] = self->gradient[k][ch];
         }
     }
     return cost;

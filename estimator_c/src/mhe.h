@@ -20,6 +20,7 @@
 #include "est_settings.h"
 #include "real.h"
 #include "thermal_net.h"
+#include "tridiag_pair.h"
 
 #define MHE_NODES 16 /* N = 15 stages; a power of two, the window is a ring */
 #define MHE_CHANNELS 2 /* 0 winding, 1 rotor */
@@ -31,14 +32,14 @@ typedef enum {
 } mhe_status_t;
 
 typedef struct {
-    real_t theta[MHE_CHANNELS];  /* the estimate at this node */
+    NET_ALIGNED real_t theta[MHE_CHANNELS];  /* the estimate at this node */
     real_t u[2];                 /* [speed rpm, torque Nm] of the stage that leaves this node */
     real_t y[MHE_CHANNELS];      /* measurement, offset removed */
     real_t weight[MHE_CHANNELS]; /* Wy, or 0 where there is none */
-    real_t memory[NET_MEMORY];   /* of the net on arrival at this node */
+    NET_ALIGNED real_t memory[NET_MEMORY]; /* of the net on arrival at this node */
+    NET_ALIGNED real_t tape[NET_TAPE];
     real_t rate[MHE_CHANNELS];   /* F of the stage that leaves this node */
     real_t slope[MHE_CHANNELS];  /* 1 + dt dF/dtheta of that stage, direct part */
-    real_t tape[NET_TAPE];
 } mhe_node_t;
 
 typedef struct {
@@ -47,6 +48,8 @@ typedef struct {
     real_t weight_arrival[MHE_CHANNELS];
     real_t weight_prior[MHE_CHANNELS];
     real_t lower, upper, tolerance;
+    bool hard_bounds;
+    real_t bound_weight;         /* of soft ones */
     real_t loss_scale;           /* degC, of Huber's and Geman and McClure's loss */
     int loss;                    /* EST_LOSS_... of est_settings.h */
     int max_sweeps;
@@ -60,7 +63,10 @@ typedef struct {
     bool careful;                /* this solve keeps to the loss's majorant */
     bool converged;              /* so far */
     real_t prior[MHE_CHANNELS];  /* theta bar of the oldest node */
-    box_qp_t qp[MHE_CHANNELS];
+    real_pair_t gradient[MHE_NODES]; /* of the cost, bounds left out, at the last sweep */
+    real_pair_t diag[MHE_NODES];     /* the matrix of each channel, and its factors */
+    real_pair_t off[MHE_NODES];
+    tridiag_pair_t factor;
 } mhe_t;
 
 typedef struct {

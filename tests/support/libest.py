@@ -18,7 +18,8 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = ("mhe", "ekf", "slow_observer", "sensor_monitor", "fusion", "offset_calibration", "estimator", "validity")
-SOURCES = (*(f"src/{name}.c" for name in CORE), "src/est_batch.c", "src/solver/tridiag.c", "src/solver/box_qp.c")
+SOLVER = tuple(f"src/solver/{name}.c" for name in ("tridiag", "tridiag_pair", "box_qp"))
+SOURCES = (*(f"src/{name}.c" for name in CORE), "src/est_batch.c", *SOLVER)
 SETTINGS = ROOT / "estimator_c" / "settings"
 WEIGHTS = ROOT / "estimator_c" / "weights" / "lstm8.json"
 NODES = 16
@@ -169,6 +170,11 @@ class Lib:
         self.memory = ct.c_int32.in_dll(self.c, "net_memory_size").value
         self.tape = ct.c_int32.in_dll(self.c, "net_tape_size").value
 
+    def select(self, kernel: str) -> bool:
+        """Choose a kernel of the net; False where this processor cannot run it."""
+        self.c.net_select.restype, self.c.net_select.argtypes = ct.c_char_p, [ct.c_char_p]
+        return self.c.net_select(kernel.encode()) == kernel.encode()
+
     def setting(self, name: str, **changes: Any) -> Setting:
         """A copy of a compiled-in setting, with fields replaced (pairs as tuples)."""
         found = self.c.est_setting_find(name.encode())
@@ -228,13 +234,19 @@ def _ptr(array: np.ndarray) -> Any:
     return array.ctypes.data_as(ct.c_void_p)
 
 
+def _aligned(size: int) -> Any:
+    """Memory for a C object, on a boundary of 64 bytes as its type asks."""
+    raw = ct.create_string_buffer(size + 64)
+    return (ct.c_char * size).from_buffer(raw, -ct.addressof(raw) % 64)
+
+
 class Mhe:
     """One mhe_t."""
 
     SIZE = 1 << 16
 
     def __init__(self, lib: Lib, setting: Setting) -> None:
-        self.lib, self.memory, self.count = lib, ct.create_string_buffer(self.SIZE), 0
+        self.lib, self.memory, self.count = lib, _aligned(self.SIZE), 0
         lib.c.mhe_init(self.memory, ct.byref(setting))
 
     def start(self, prior: Any, c: Any, h: Any) -> None:
@@ -251,6 +263,15 @@ class Mhe:
     def solve(self) -> tuple[int, MheResult]:
         result = MheResult()
         return self.lib.c.mhe_solve(self.memory, ct.byref(result)), result
+
+    def feedback(self) -> tuple[int, MheResult]:
+        """The estimate after one sweep; `finish` takes its result."""
+        result = MheResult()
+        return self.lib.c.mhe_feedback(self.memory, ct.byref(result)), result
+
+    def finish(self, result: MheResult) -> int:
+        """What `feedback` left; `result` becomes that of `solve`."""
+        return self.lib.c.mhe_finish(self.memory, ct.byref(result))
 
     def theta(self) -> np.ndarray:
         """Temperatures of the window, oldest first: (count, 2)."""
@@ -282,7 +303,7 @@ class Estimator:
     SIZE = 1 << 17
 
     def __init__(self, lib: Lib, setting: Setting) -> None:
-        self.lib, self.memory = lib, ct.create_string_buffer(self.SIZE)
+        self.lib, self.memory = lib, _aligned(self.SIZE)
         self.error = lib.c.estimator_init(self.memory, ct.byref(setting))
         self._step, self._out = lib.c.estimator_step, Out()
 

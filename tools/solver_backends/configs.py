@@ -26,7 +26,9 @@ class Config:
     loss : int
         EST_LOSS_... for all steps; -1: the setting's.
     chief : bool
-        Converged and comparable: it is judged against the oracle, and is a key of the JSON document.
+        A key of the JSON document.
+    early : bool
+        Its estimate is the one it gives before it has converged.
     """
 
     name: str
@@ -37,6 +39,12 @@ class Config:
     tolerance_degc: float = 0.0
     loss: int = -1
     chief: bool = False
+    early: bool = False
+
+    @property
+    def converges(self) -> bool:
+        """It solves the recorded problems to their tolerance, so that its error can be told."""
+        return self.sweeps == 0 and self.loss < 0 and not self.early
 
     def words(self, library: str) -> str:
         """The runner's argument."""
@@ -59,6 +67,7 @@ CONFIGS = (
            loss=QUADRATIC),
     Config("simd_avx2", "θ-space, AVX2 kernel", DOUBLE, "avx2"),
     Config("simd_2", "θ-space, vector kernel, two sweeps", DOUBLE, "", sweeps=2),
+    Config("simd_feedback", "θ-space, vector kernel, feedback after one sweep", DOUBLE, "feedback", early=True),
     Config("portable_2", "θ-space, portable C, two sweeps", DOUBLE, "portable", sweeps=2),
     Config("f32_2", "θ-space, portable C, float, two sweeps", FLOAT, "", sweeps=2),
     Config("hpipm_rti", "one SQP iteration + HPIPM, fully condensed, bounds where met", HPIPM, "full-free", sweeps=1),

@@ -18,6 +18,7 @@ from tools.solver_backends.figures import Measured, read_measured
 from tools.solver_backends.stream import Segment
 
 COUNTED_FROM, COUNTED_TO = 100, 130  # steps of a segment whose instructions are counted: after the fault has begun
+MHE_PARTS = ("timed_calls", "timed_solve")  # without the run forward
 COUNTED = ("lap, seed 0", "fault offset", "fault noise", "soft bound met", "quadratic loss")
 
 
@@ -59,17 +60,16 @@ class Bench:
             raise MeasureError(done.stderr.strip() or f"bench_solver ended with status {done.returncode}")
         return read_measured(np.fromfile(out), done.stdout.split())
 
-    def count(self, place: int, segments: Sequence[Segment]) -> int | None:
-        """Mean instructions of a step by callgrind; None without valgrind or where it cannot run the code."""
+    def count(self, place: int, segments: Sequence[Segment], functions: Sequence[str] = ("timed_*",)) -> int | None:
+        """Mean instructions of a step in these functions, by callgrind; None without valgrind, or where it cannot run the code."""
         if shutil.which("valgrind") is None:
             return None
-        heads = [s.head(COUNTED_TO) for s in segments if s.situation.name in COUNTED]
-        steps = sum(max(0, len(s) - COUNTED_FROM) for s in heads)
+        heads, steps = _counted_heads(segments), counted_steps(segments)
         if steps == 0:
             return None
         stream = self._write(heads, "counted.bin")
         done = self._run([
-            "valgrind", "--tool=callgrind", "--toggle-collect=timed_*", f"--callgrind-out-file={self._folder / 'callgrind.out'}",
+            "valgrind", "--tool=callgrind", *(f"--toggle-collect={name}" for name in functions), f"--callgrind-out-file={self._folder / 'callgrind.out'}",
             str(self._program), str(stream), str(self._folder / "counted.out"), "-s", str(COUNTED_FROM), self._words[place],
         ])  # fmt: skip
         found = re.search(r"Collected : (\d+)", done.stderr)
@@ -83,6 +83,15 @@ class Bench:
     @staticmethod
     def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
         return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def counted_steps(segments: Sequence[Segment]) -> int:
+    """Number of steps whose instructions are counted."""
+    return sum(max(0, len(head) - COUNTED_FROM) for head in _counted_heads(segments))
+
+
+def _counted_heads(segments: Sequence[Segment]) -> list[Segment]:
+    return [s.head(COUNTED_TO) for s in segments if s.situation.name in COUNTED]
 
 
 def pinned_core() -> int:

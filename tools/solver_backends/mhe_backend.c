@@ -1,7 +1,8 @@
 /* Backend: estimator_c's own MHE, whatever build it is compiled with (double or float, any kernel).
  *
- * Variants: a kernel's name ("portable", "avx2", "avx512"; "" is the processor's best), or "reference": portable, as many sweeps as
- * the tolerance asks for, and the problem kept. */
+ * Variants: a kernel's name ("portable", "avx2", "avx512"; "" is the processor's best), "feedback": the best kernel, the estimate
+ * after one sweep and the rest in backend_finish(), or "reference": portable, as many sweeps as the tolerance asks for, and the
+ * problem kept. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -16,6 +17,8 @@ typedef __typeof__(((mhe_t *)0)->prior[0]) value_t; /* double, or float in that 
 static mhe_t mhe;
 static window_t window; /* of "reference" only */
 static bool reference;
+static bool feedback;
+static mhe_result_t solved;
 static int sweeps_fixed;
 static double tolerance_given;
 static int loss_given = -1;
@@ -26,7 +29,8 @@ int backend_open(const char *variant, int sweeps, double tolerance, int loss)
     tolerance_given = tolerance;
     loss_given = loss;
     reference = strcmp(variant, "reference") == 0;
-    const char *kernel = reference ? "portable" : *variant == '\0' ? NULL : variant;
+    feedback = strcmp(variant, "feedback") == 0;
+    const char *kernel = reference ? "portable" : feedback || *variant == '\0' ? NULL : variant;
     return net_select(kernel) != NULL ? 0 : 1;
 }
 
@@ -115,8 +119,7 @@ void backend_call(const double record[])
 
 void backend_solve(backend_result_t *result)
 {
-    mhe_result_t solved;
-    const mhe_status_t status = mhe_solve(&mhe, &solved);
+    const mhe_status_t status = feedback ? mhe_feedback(&mhe, &solved) : mhe_solve(&mhe, &solved);
     *result = (backend_result_t){
         .theta = {(double)solved.theta[0], (double)solved.theta[1]},
         .kkt_degc = (double)solved.kkt_degc,
@@ -147,6 +150,9 @@ void backend_ahead(const double inputs[][2], int steps, backend_result_t *result
 
 void backend_finish(void)
 {
+    if (feedback) {
+        (void)mhe_finish(&mhe, &solved);
+    }
     if (!reference) {
         return;
     }

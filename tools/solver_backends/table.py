@@ -11,7 +11,7 @@ from tools.solver_backends.figures import Figures, best_hpipm, ratio
 
 BEGIN, END = "<!-- bench solver: begin -->", "<!-- bench solver: end -->"
 NONE = "–"
-HEAD = ("", "median µs", "p99", "max", "of which solve", "sweeps", "instructions", "error °C", "state, bytes")
+HEAD = ("", "median µs", "p99", "max", "of which solve", "sweeps", "instructions", "of which MHE", "error °C", "state, bytes")
 
 
 class DocumentError(Exception):
@@ -33,6 +33,7 @@ def rows(found: dict[str, Figures]) -> list[list[str]]:
             number(f.get("solve_median_us"), ".1f"),
             number(f.get("sweeps_mean"), ".1f"),
             number(f["instructions"], ",.0f"),
+            number(f.get("instructions_mhe"), ",.0f"),
             number(f["max_error_degc"], ".0e"),
             number(f["state_bytes"], ",.0f"),
         ]
@@ -88,7 +89,7 @@ def markdown(found: dict[str, Figures], notes: Sequence[str]) -> str:
     return "\n\n".join([*parts, "\n".join(f"- {line}" for line in [*verdicts(found), *notes])])
 
 
-def inserted(path: Path, tables: str) -> str:
+def inserted(path: Path, tables: str, begin: str = BEGIN, end: str = END) -> str:
     """The document with `tables` between its markers.
 
     Raises
@@ -100,10 +101,10 @@ def inserted(path: Path, tables: str) -> str:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise DocumentError(f"{path}: {error.strerror}; give a document with the two markers") from error
-    if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
-        raise DocumentError(f"{path}: needs the lines {BEGIN} and {END}, once each and in this order")
-    before, rest = text.split(BEGIN)
-    return f"{before}{BEGIN}\n{tables}\n{END}{rest.split(END)[1]}"
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise DocumentError(f"{path}: needs the lines {begin} and {end}, once each and in this order")
+    before, rest = text.split(begin)
+    return f"{before}{begin}\n{tables}\n{end}{rest.split(end)[1]}"
 
 
 def _aligned(table: list[list[str]]) -> str:

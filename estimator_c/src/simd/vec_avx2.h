@@ -91,8 +91,8 @@ VEC_INLINE double vec_sum(vec_t x)
     return _mm_cvtsd_f64(_mm_add_sd(two, _mm_unpackhi_pd(two, two)));
 }
 
-/* 1/(1 + 2^a) for |a| < 1e15, absolute error <= 3e-16; 0 and 1 within 2^-64 where the power is held there; not finite gives
- * NaN. The polynomial is that of net_gates(). The power of two is made beside the polynomial, which takes longer. */
+/* 1/(1 + 2^a) for |a| < 1e15, absolute error <= 3e-16; 0 and 1 within 2^-64 where the power is held there; NaN gives NaN,
+ * an infinite a its end or NaN. The polynomial is that of net_gates(). The power of two is made beside the polynomial, which takes longer. */
 VEC_INLINE vec_t vec_gate(vec_t a)
 {
     const vec_t one = vec_all(1.0);
