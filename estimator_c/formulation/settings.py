@@ -30,6 +30,7 @@ class Field:
 
 ESTIMATORS = ("mhe", "ekf")
 ARRIVALS = ("smoothed", "filter")
+MODES = ("converged", "feedback")
 LOSSES = ("quadratic", "huber", "geman-mcclure")
 FIELDS = (
     Field("estimator", "kind", "kind", "choice", 0, 1, "whose estimate is published", ESTIMATORS),
@@ -72,6 +73,7 @@ FIELDS = (
     Field("bounds", "lower_degc", "lower_degc", "float", -273.15, 1000, "lower bound on both temperatures"),
     Field("bounds", "upper_degc", "upper_degc", "float", -273.15, 1000, "upper bound on both temperatures"),
     Field("bounds", "weight", "bound_weight", "float", 0, 1e9, "penalty of soft bounds, 1/K^2 per node"),
+    Field("solver", "mode", "mode", "choice", 0, 1, "publish the solution, or the first sweep's and solve on", MODES),
     Field("solver", "max_sweeps", "max_sweeps", "int", 1, 100, "most gradient sweeps per step"),
     Field("solver", "tolerance_degc", "tolerance_degc", "float", 0, 1, "stop when the next change is below this"),
     Field(

@@ -34,6 +34,7 @@ void est_batch_run(estimator_t *self, int64_t intervals, uint16_t first_tick, co
         estimator_feed_temp(self, tick, w, r, !isnan(w), !isnan(r));
         estimator_out_t result;
         estimator_step(self, &result);
+        estimator_finish(self);
         write_row(&result, &out[k * EST_BATCH_COLUMNS]);
     }
 }

@@ -253,6 +253,7 @@ static est_cycle_status run(est_cycle *self, rt_job *job) {
     /* A job that finds the bus gone still ends in good order: every started job is accounted for. */
     const est_cycle_status published = publish(self, &output, &sent);
     rt_task_published(&self->task, job, sent, stale);
+    estimator_finish(&self->estimator);
     status = status == EST_CYCLE_OK ? published : status;
     if (status == EST_CYCLE_OK) {
         status = publish_timing(self, job, stale);

@@ -340,6 +340,11 @@ static void measure_newest(estimator_t *self, int64_t k)
     }
 }
 
+void estimator_finish(estimator_t *self)
+{
+    self->counters.unconverged += fusion_finish(&self->fusion) == MHE_MAX_SWEEPS;
+}
+
 /* The estimate at the delayed node, then the net forward to node `now` with the stored inputs. */
 static void solve(estimator_t *self, int64_t now, estimator_out_t *out)
 {
@@ -375,6 +380,7 @@ static void solve(estimator_t *self, int64_t now, estimator_out_t *out)
 static void consume_interval(estimator_t *self, estimator_out_t *out)
 {
     const int64_t k = self->next_interval;
+    estimator_finish(self); /* several intervals in one step: each begins from a finished solution */
     close_interval(self, k, &out->stale_input);
     self->next_interval = k + 1;
     out->intervals++;
@@ -483,6 +489,7 @@ void estimator_step(estimator_t *self, estimator_out_t *out)
         consume_interval(self, out);
     }
     if (self->measurement_pending && self->started) {
+        estimator_finish(self);
         solve(self, self->next_interval, out);
     }
     if (self->started) {

@@ -142,4 +142,7 @@ void estimator_feed_coolant(estimator_t *self, double coolant_degc, bool soaked,
  * measurement arrived after its interval had been consumed. Never fails: trouble is in out->status. */
 void estimator_step(estimator_t *self, estimator_out_t *out);
 
+/* After publishing: in mode feedback the rest of the last solution, as long as mhe_solve() takes; else nothing. Never fails. */
+void estimator_finish(estimator_t *self);
+
 #endif

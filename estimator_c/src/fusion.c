@@ -207,25 +207,42 @@ static bool ekf_finite(const ekf_t *ekf)
 
 void fusion_solve(fusion_t *self, fusion_estimate_t *estimate)
 {
-    mhe_result_t result = {.kkt_degc = NAN};
+    mhe_result_t *result = &self->result;
+    const bool feedback = self->setting.mode == EST_MODE_FEEDBACK;
+    *result = (mhe_result_t){.kkt_degc = NAN};
     *estimate = (fusion_estimate_t){.status = MHE_OK};
     bool solved = false;
     if (uses_mhe(self)) {
         set_loss_scale(self);
-        estimate->status = mhe_solve(&self->mhe, &result);
+        estimate->status = feedback ? mhe_feedback(&self->mhe, result) : mhe_solve(&self->mhe, result);
         solved = estimate->status == MHE_OK ||
-                 (estimate->status == MHE_MAX_SWEEPS && result.kkt_degc < USABLE_KKT_DEGC);
+                 (estimate->status == MHE_MAX_SWEEPS && (feedback || result->kkt_degc < USABLE_KKT_DEGC));
+        self->unfinished = feedback && estimate->status == MHE_MAX_SWEEPS;
+        estimate->status = self->unfinished ? MHE_OK : estimate->status;
     }
-    estimate->kkt_degc = result.kkt_degc;
-    estimate->sweeps = result.sweeps;
+    estimate->kkt_degc = result->kkt_degc;
+    estimate->sweeps = result->sweeps;
     estimate->usable = solved || ekf_finite(&self->ekf);
     self->fallback = uses_mhe(self) && !solved;
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-        estimate->theta[ch] = solved ? result.theta[ch] : self->ekf.theta[ch];
+        estimate->theta[ch] = solved ? result->theta[ch] : self->ekf.theta[ch];
         estimate->variance[ch] = self->ekf.p[ch][ch];
     }
     estimate->memory = solved ? mhe_node(&self->mhe, 0)->memory : self->ekf.memory;
     if (estimate->status == MHE_INVALID && estimate->usable) {
         mhe_start(&self->mhe, self->ekf.theta, self->ekf.memory); /* a window that is not finite stays so */
     }
+}
+
+mhe_status_t fusion_finish(fusion_t *self)
+{
+    if (!self->unfinished) {
+        return MHE_OK;
+    }
+    self->unfinished = false;
+    const mhe_status_t status = mhe_finish(&self->mhe, &self->result);
+    if (status == MHE_INVALID && ekf_finite(&self->ekf)) {
+        mhe_start(&self->mhe, self->ekf.theta, self->ekf.memory);
+    }
+    return status;
 }

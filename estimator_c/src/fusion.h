@@ -34,6 +34,8 @@ typedef struct {
     slow_observer_t slow;
     sensor_monitor_t monitor[MHE_CHANNELS];
     double share[MHE_CHANNELS];  /* of the newest value; 0: not used */
+    mhe_result_t result;         /* of the last solution */
+    bool unfinished;             /* mode feedback: fusion_finish() has something to do */
     bool fallback;               /* the last estimate is the EKF's in place of the MHE's */
 } fusion_t;
 
@@ -68,7 +70,10 @@ double fusion_measure(fusion_t *self, int channel, double y, double raw, double 
 /* A value for a node `age` steps back, which came after that node's step. Returns the innovation; NAN: too late. */
 double fusion_measure_late(fusion_t *self, int age, int channel, double y, double raw);
 
-/* Solve and give the estimate at the newest node. */
+/* Solve and give the estimate at the newest node; in mode feedback, after one sweep. */
 void fusion_solve(fusion_t *self, fusion_estimate_t *estimate);
+
+/* Mode feedback: the rest of the solution, which the next step begins from. Returns its status; MHE_OK where nothing is left. */
+mhe_status_t fusion_finish(fusion_t *self);
 
 #endif

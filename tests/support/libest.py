@@ -41,7 +41,7 @@ class Setting(ct.Structure):
         ("arrival_from", ct.c_int32), ("weight_prior", pair),
         ("newest_measurement", ct.c_bool), ("hard_bounds", ct.c_bool),
         ("lower_degc", f64), ("upper_degc", f64), ("bound_weight", f64),
-        ("max_sweeps", ct.c_int32), ("tolerance_degc", f64),
+        ("mode", ct.c_int32), ("max_sweeps", ct.c_int32), ("tolerance_degc", f64),
         ("spin_up_steps", ct.c_int32), ("max_gap_steps", ct.c_int32),
     )  # fmt: skip
 
