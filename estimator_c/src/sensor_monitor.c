@@ -269,6 +269,7 @@ static monitor_verdict_t judge_stepped(sensor_monitor_t *self, const monitor_inp
         self->rebased = false;
         self->since_step = 0;
         self->run = 0;
+        return (monitor_verdict_t){0};
     }
     return (monitor_verdict_t){.share = self->run > 0 ? 0.0 : REBASED_SHARE, .offset = self->offset};
 }
@@ -314,7 +315,7 @@ monitor_verdict_t sensor_monitor_step(sensor_monitor_t *self, const monitor_inpu
 double sensor_monitor_late(const sensor_monitor_t *self, double raw, double residual, double variance)
 {
     if (!self->trusted || raw < self->range_low || raw > self->range_high ||
-        fabs(residual) > self->gate * sqrt(self->spread_r + variance)) {
+        !(fabs(residual) <= self->gate * sqrt(self->spread_r + variance))) { /* NAN too */
         return 0.0;
     }
     return self->r / self->spread_r;
