@@ -25,7 +25,7 @@ STEP = (
 )  # and the generated net: what is measured
 BENCH = ("replay", "an500_port", "startup", "memory")
 ECU_FLAGS = ("-mcpu=cortex-m7", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv5-sp-d16")
-OPTIMISE = "-Os"  # fewer instructions than -O2 here: constants come from literal pools
+OPTIMISE = "-Os"  # fewer instructions and less flash than -O2 here
 PACKAGES = ("gcc-arm-none-eabi", "qemu-system-arm")
 TOOLS = ("arm-none-eabi-gcc", "arm-none-eabi-nm", "arm-none-eabi-size", "qemu-system-arm")
 
