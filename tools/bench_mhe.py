@@ -4,7 +4,8 @@
 
 Data: the plant's lap from second 400 with the sensor's noise. `mhe`: append a node, measure, solve. `core`: ten motor
 frames, a temperature frame and estimator_step() with its 15-step prediction. The fixed sweep counts show the price of
-a sweep; "converged" is the default setting. All with the portable kernel of the net. Needs gcc; valgrind for the instruction counts.
+a sweep; "converged" is the default setting. All with the portable kernel of the net. Needs gcc; valgrind for the
+instruction counts.
 """
 
 from __future__ import annotations

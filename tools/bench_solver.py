@@ -3,9 +3,9 @@
     rt-runner bench solver [--backend simd,hpipm_full] [--steps N] [--repeat R] [--json FILE] [--details FILE]
                            [--doc docs/solver.md] [--weights FILE]
 
-The steps are what the estimator asked of its MHE on drives of the plant (tools/solver_backends/stream.py): the lap, sensor
-faults, active bounds, other losses. A step is what happens between two estimates: advance, arrival cost, measurements, solve, run
-forward through the sensor's delay. Needs gcc; valgrind for the instructions.
+The steps are what the estimator asked of its MHE on drives of the plant (tools/solver_backends/stream.py): the lap,
+sensor faults, active bounds, other losses. A step is what happens between two estimates: advance, arrival cost,
+measurements, solve, run forward through the sensor's delay. Needs gcc; valgrind for the instructions.
 """
 
 from __future__ import annotations
@@ -35,8 +35,10 @@ from tools.solver_backends.oracle import NODES, Answers
 from tools.solver_backends.stream import Segment, record_all, shortened
 
 ASKED = 400  # windows that the oracle is asked, fewer where fewer steps are run
-KERNEL_NOTE = "instructions by callgrind over {steps} steps (lap, faults, bounds, quadratic); the vector kernel counted is AVX2, " \
-    "valgrind knows no AVX-512"  # fmt: skip
+KERNEL_NOTE = (
+    "instructions by callgrind over {steps} steps (lap, faults, bounds, quadratic); the vector kernel counted is AVX2: "
+    "valgrind knows no AVX-512"
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -50,7 +52,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             table.inserted(args.doc, "")
         with tempfile.TemporaryDirectory(prefix="bench-solver-") as name:
             found, notes = bench(args, configs, with_oracle, Path(name), shown)
-    except (UnknownBackend, BuildError, MeasureError, FormulationError, PlantError, table.DocumentError, ValueError) as error:
+    except (
+        UnknownBackend,
+        BuildError,
+        MeasureError,
+        FormulationError,
+        PlantError,
+        table.DocumentError,
+        ValueError,
+    ) as error:
         print(f"bench_solver: {error}", file=sys.stderr)
         return 1
     except OSError as error:
@@ -91,9 +101,7 @@ def bench(
     answers, took_us = ask_oracle(measured, Answers(weights))
     kinds = kinds_of(segments)
     ran = [machine.configs[place] for place in places]
-    figures = [
-        figures_of(measured, at, answers, kinds, config.converges) for at, config in enumerate(ran)
-    ]
+    figures = [figures_of(measured, at, answers, kinds, config.converges) for at, config in enumerate(ran)]
     if not args.no_count:
         say("instructions …")
         for at, place in enumerate(places[1:], start=1):
@@ -107,8 +115,8 @@ def bench(
         f"{steps:,} recorded steps, {len(answers)} of them also solved by ipopt, which the reference "
         f"({REFERENCE.title}) meets to {figures[0]['oracle_error_degc'] or float('nan'):.0e} °C",
         f"one core, backends in turns of 64 steps, shortest of {args.repeat} passes; {_processor()}",
-        f"run forward through the delay, part of every step: median {min(f['ahead_median_us'] for f in figures):.1f} µs "
-        "at best",
+        f"run forward through the delay, part of every step: median {min(f['ahead_median_us'] for f in figures):.1f} "
+        "µs at best",
     ]
     notes += [] if args.no_count else [KERNEL_NOTE.format(steps=counted_steps(segments))]
     notes += [f"not on this machine: {', '.join(absent)}"] if absent else []

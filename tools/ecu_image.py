@@ -19,13 +19,17 @@ ROOT = Path(__file__).resolve().parents[1]
 BASE = ROOT / "estimator_c"
 ECU = BASE / "ecu"
 SETTINGS = BASE / "settings"
-STEP = ("src/mhe.c", "src/solver/box_qp.c", "src/solver/tridiag.c")  # with the generated net: what is measured
+STEP = (
+    BASE / "src" / "mhe.c",
+    *sorted((BASE / "src" / "solver").glob("*.c")),
+)  # and the generated net: what is measured
 BENCH = ("replay", "an500_port", "startup", "memory")
 ECU_FLAGS = ("-mcpu=cortex-m7", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv5-sp-d16")
+OPTIMISE = "-Os"  # fewer instructions and less flash than -O2 here
 PACKAGES = ("gcc-arm-none-eabi", "qemu-system-arm")
 TOOLS = ("arm-none-eabi-gcc", "arm-none-eabi-nm", "arm-none-eabi-size", "qemu-system-arm")
 
-# Same arithmetic on both machines: no fused multiply-add, and no reordering (-O2 does none).
+# Same arithmetic on both machines: no fused multiply-add, and no reordering (no -O does any).
 FLAGS = (
     "-std=c11", "-g", "-ffp-contract=off", "-ffunction-sections", "-fdata-sections",
     "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror",
@@ -46,7 +50,7 @@ class Image:
 
     elf: for the ECU; host: the same for this machine; double: the same in double. In bytes: flash, all in the flash
     region, start-up code included; step_flash, code and tables of the step alone; ram_static, data and bss in the RAM
-    region. frames: stack of each function of the step, as the compiler says.
+    region. compiled: optimisation flags. frames: stack of each function of the step, as the compiler says.
     """
 
     elf: Path
@@ -56,6 +60,7 @@ class Image:
     step_flash: int
     ram_static: int
     frames: dict[str, int]
+    compiled: str
 
 
 def missing_tools() -> list[str]:
@@ -63,7 +68,7 @@ def missing_tools() -> list[str]:
     return [tool for tool in TOOLS if shutil.which(tool) is None]
 
 
-def build_image(weights: Path, folder: Path, flags: tuple[str, ...] = ("-O2",)) -> Image:
+def build_image(weights: Path, folder: Path, flags: tuple[str, ...] = (OPTIMISE,)) -> Image:
     """Generate the C of `weights` and build the programs into `folder`; `flags` are the ECU's.
 
     Raises
@@ -101,12 +106,13 @@ def build_image(weights: Path, folder: Path, flags: tuple[str, ...] = ("-O2",)) 
         step_flash=_step_flash(folder / "ecu.map", measured),
         ram_static=symbols["ram_static"],
         frames=_frames(measured),
+        compiled=" ".join(flags),
     )
 
 
 def _sources(weights: Path, folder: Path, real: str) -> list[Path]:
     generate(weights, SETTINGS, folder / real, REALS[real])
-    return [*(BASE / source for source in STEP), *sorted((folder / real).glob("thermal_net*.c"))]
+    return [*STEP, *sorted((folder / real).glob("thermal_net*.c"))]
 
 
 def _flags(folder: Path, real: str) -> list[str]:

@@ -28,7 +28,7 @@ EXIT = {
     5: "a fault exception: the image is broken",
 }  # port.h
 
-PARTS = ("advance", "arrival", "measure", "level", "solve")
+PARTS = ("advance", "arrival", "measure", "level", "feedback", "finish")
 MAGIC = 0x31554345
 FIRST = np.dtype(
     [(name, "<u4") for name in ("magic", "real_bytes", "memory", "state", "reading", "loop_1k", "loop_3k", "reserved")]
@@ -39,7 +39,7 @@ def answer_type(real: str) -> np.dtype:
     """answer_t of replay.c; real: "<f4" or "<f8"."""
     return np.dtype([
         ("status", "<i4"), ("sweeps", "<i4"), ("active", "<i4"), ("count", "<i4"), ("ticks", "<u4", len(PARTS)),
-        ("stack", "<u4"), ("window_hash", "<u4"), ("reserved", "<u4"), ("theta", real, 2), ("kkt_degc", real),
+        ("stack", "<u4"), ("window_hash", "<u4"), ("theta", real, 2), ("kkt_degc", real),
         ("innovation", real, 2), ("padding", real),
     ])  # fmt: skip
 
@@ -64,7 +64,9 @@ class Replay:
 
 
 def fixed_sweeps(data: np.ndarray, sweeps: int) -> np.ndarray:
-    """The same calls, each solution with exactly that many sweeps."""
+    """The same calls, each solution with exactly that many sweeps; 0: until it has converged, as recorded."""
+    if sweeps == 0:
+        return data
     out = data.copy()
     for place, op, _ in records(data):
         if op == INIT:

@@ -11,7 +11,8 @@
 #define MAGIC 0x31554345u /* "ECU1" */
 
 
-enum { PART_ADVANCE, PART_ARRIVAL, PART_MEASURE, PART_LEVEL, PART_SOLVE, PARTS }; /* LEVEL: forget and shift */
+/* LEVEL: forget and shift. FEEDBACK and FINISH are mhe_solve() in two. */
+enum { PART_ADVANCE, PART_ARRIVAL, PART_MEASURE, PART_LEVEL, PART_FEEDBACK, PART_FINISH, PARTS };
 
 typedef struct {
     uint32_t magic, real_bytes, memory, state_bytes;
@@ -25,7 +26,6 @@ typedef struct {
     uint32_t ticks[PARTS]; /* since the last solution, readings of the counter taken out */
     uint32_t stack_bytes;  /* deepest call of the step, with the caller's arguments */
     uint32_t window_hash;  /* of every bit of the window's temperatures and memories */
-    uint32_t reserved;
     real_t theta[MHE_CHANNELS];
     real_t kkt_degc;
     real_t innovation[MHE_CHANNELS]; /* of the last measurement attached */
@@ -97,9 +97,15 @@ static void solve(void)
 {
     mhe_result_t result;
     port_stack_paint();
-    const uint32_t begun = port_ticks();
-    const mhe_status_t status = mhe_solve(&mhe, &result);
-    count(PART_SOLVE, begun);
+    uint32_t begun = port_ticks();
+    mhe_status_t status = mhe_feedback(&mhe, &result);
+    count(PART_FEEDBACK, begun);
+    if (status != MHE_INVALID) {
+        port_stack_paint();
+        begun = port_ticks();
+        status = mhe_finish(&mhe, &result);
+        count(PART_FINISH, begun);
+    }
     answer.status = (int32_t)status;
     answer.sweeps = result.sweeps;
     answer.active = result.active;

@@ -42,8 +42,8 @@ def c_signature(function: ca.Function, name: str) -> str:
 def c_function(function: ca.Function, real: Real = DOUBLE) -> str:
     """`function` as a static C function of its name without "net_", on real_t of real.h, its constants of that type.
 
-    All inputs are read before the first output is written, so an output may share memory with an input. exp() is known as
-    part of a gate, 1/(1 + exp(a)), alone; gates that do not wait for each other are computed together.
+    All inputs are read before the first output is written, so an output may share memory with an input. exp() is known
+    as part of a gate, 1/(1 + exp(a)), alone; gates that do not wait for each other are computed together.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def c_function(function: ca.Function, real: Real = DOUBLE) -> str:
 
 
 class _Printer:
-    """One pass over CasADi's instructions; lines are kept by depth, so that all gates of a depth come after their arguments."""
+    """One pass over CasADi's instructions; lines are kept by depth, so all gates of a depth follow their arguments."""
 
     def __init__(self, function: ca.Function, real: Real) -> None:
         self.function, self.real = function, real

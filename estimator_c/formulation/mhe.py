@@ -5,8 +5,8 @@ Two statements of one problem over nodes k = 0..m (theta in degC, rates in degC/
     min 1/2 |theta_0 - prior|^2_P0 + sum_k Wy,k s^2 rho((y_k - theta_k)/s) + 1/2 sum_k |w_k|^2_Ww
     theta_{k+1} = theta_k + dt F(u_k, theta_k, c_k, h_k) + w_k,   (c, h)_{k+1} = LSTM(u_k, theta_k, c_k, h_k)
 
-rho(x) = x^2/2 (quadratic; s does not matter), |x| - 1/2 beyond |x| = 1 (Huber 1964), or x^2/2/(1 + x^2) (Geman and McClure 1987),
-which is not convex: the minimum found is the one whose valley the guess lies in.
+rho(x) = x^2/2 (quadratic; s does not matter), |x| - 1/2 beyond |x| = 1 (Huber 1964), or x^2/2/(1 + x^2) (Geman and
+McClure 1987), which is not convex: the minimum found is the one whose valley the guess lies in.
 
 `shooting`: unknowns theta, c, h of all nodes and w of all stages, the dynamics as equality constraints.
 `theta`: w eliminated and c, h substituted; unknowns theta alone. Both have the same solution.

@@ -1,7 +1,7 @@
 """The number type of the generated code and of the solver around it: real.h, with the gates of the net.
 
-One header per type, written by the generator, so that no source knows which it is compiled for. Exponential and gates are our
-own: no branch, no table, no library.
+One header per type, written by the generator, so that no source knows which it is compiled for. Exponential and gates
+are our own: no branch, no table, no library.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def real_header(real: Real, banner: str) -> str:
     poly = poly.replace(" + r * (", " + r * (\n            ")
     shift = 1.5 * 2.0**real.fraction_bits
     hold = FLOAT_HOLD if real is FLOAT else DOUBLE_HOLD
-    return f"""{banner}/* The number type of the net and its solver. All functions: pure, any thread, no branch, no library. */
+    return f"""{banner}/* The number type of the net and its solver. All functions: pure, any thread, no library. */
 #ifndef REAL_H
 #define REAL_H
 
@@ -101,8 +101,8 @@ static inline bool real_finite(real_t x)
 }}
 
 /* a[k] = 1/(1 + exp(a[k])) for n gates: a sigmoid of -a, and tanh(a/2) = 1 - 2/(1 + exp(a)). Absolute error of either
- * <= {GATE_ERROR[real.c_type]} for |a| < {DOMAIN[real.c_type]}, 0 and 1 within 2^-{LIMIT} where the power is held there; NaN gives NaN,
- * an infinite a its end or NaN. */
+ * <= {GATE_ERROR[real.c_type]} for |a| < {DOMAIN[real.c_type]}; the ends are held within 2^-{LIMIT - 1} of 0 and 1;
+ * NaN gives NaN, an infinite a its end or NaN. No branch. */
 static inline void net_gates(real_t a[], int n)
 {{
     const real_t shift = {real.literal(shift)}; /* adding it rounds to a whole number, which its last bits then show */
@@ -124,9 +124,9 @@ static inline void net_gates(real_t a[], int n)
 """
 
 
-# The whole number, held within limits, plus the exponent's bias, into the last bits of `bits`: in integers where a processor's
-# vectors or instructions know them, else in floating point. A comparison of floating point numbers would become a branch
-# and keep gcc -O2 from computing two gates at once.
+# The whole number, held within limits, plus the exponent's bias, into the last bits of `bits`: in integers where a
+# processor's vectors or instructions know them, else in floating point. A comparison of floating point numbers would
+# become a branch and keep gcc -O2 from computing two gates at once.
 FLOAT_HOLD = """\
         memcpy(&bits, &shifted, sizeof bits);
         int32_t whole = (int32_t)(bits - 0x4b400000u);
@@ -138,6 +138,6 @@ DOUBLE_HOLD = """\
         const real_t twice = fabs(whole + 64.0) - fabs(whole - 63.0); /* 2 whole + 1 within -64..63 */
         const real_t held = (0.5 * twice + 1022.5) + shift;
         memcpy(&bits, &held, sizeof bits);"""
-LIMIT = 64  # of the power of two: 0 and 1 to the last bit, no denormal numbers; a processor may have one instruction for it
+LIMIT = 64  # of the power of two: 0 and 1 to the last bit, no denormal numbers; some processors have an instruction
 DOMAIN = {"double": "1e15", "float": "1e6"}
 GATE_ERROR = {"double": "6e-16", "float": "3e-7"}  # held by tests/unit/test_net_gates.py

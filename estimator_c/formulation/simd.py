@@ -1,9 +1,9 @@
 """The net's step and its adjoint as vector code: cells side by side, one vector of the machine after the other.
 
 Written from the weights, not from CasADi's scalar instructions: a gate of eight cells is one row of eight numbers, a
-column of the weight matrix times one input. The C is straight-line on the vec_... functions of src/simd/vec_*.h; the same text
-serves every width. Scaling of inputs and outputs is folded in as in net.py, and so is the factor of each gate's exponential:
-a sigmoid is 1/(1 + 2^a) with a = -z/ln 2, and tanh z is 2/(1 + 2^a) - 1 with a = -2 z/ln 2.
+column of the weight matrix times one input. The C is straight-line on the vec_... functions of src/simd/vec_*.h, for
+any width. Scaling of inputs and outputs is folded in as in net.py, and so is the factor of each gate's exponential: a
+sigmoid is 1/(1 + 2^a) with a = -z/ln 2, and tanh z is 2/(1 + 2^a) - 1 with a = -2 z/ln 2.
 
 Tests hold all of it against numpy and CasADi to 1e-12.
 """
@@ -206,7 +206,8 @@ class _Kernel:
             out.let(f"g_{tag}", f"vec_fma(vec_all(2.0), s_g_{tag}, vec_all(-1.0))")
             out.let(f"ig_{tag}", f"vec_fma(vec_add(i_{tag}, i_{tag}), s_g_{tag}, vec_neg(i_{tag}))")
             out.let(f"c_{tag}", f"vec_fma(f_{tag}, {c}, ig_{tag})")
-            out.let(f"a_t_{tag}", f"vec_fma(f_{tag}, vec_mul({c}, vec_all({tanh})), vec_mul(ig_{tag}, vec_all({tanh})))")
+            scaled_c, scaled_ig = f"vec_mul({c}, vec_all({tanh}))", f"vec_mul(ig_{tag}, vec_all({tanh}))"
+            out.let(f"a_t_{tag}", f"vec_fma(f_{tag}, {scaled_c}, {scaled_ig})")
             out.let(f"s_t_{tag}", f"vec_gate(a_t_{tag})")
             out.let(f"t_{tag}", f"vec_fma(vec_all(2.0), s_t_{tag}, vec_all(-1.0))")
             out.let(f"h_{tag}", f"vec_fma(vec_add(o_{tag}, o_{tag}), s_t_{tag}, vec_neg(o_{tag}))")
@@ -235,7 +236,7 @@ class _Kernel:
         return self.out.take()
 
     def _pull_back(self, seeds: dict[int, str], with_memory: bool) -> None:
-        """From rate_bar (all rates, or one of them that is 1) and memory_next_bar to theta_{t} and, stored, memory_bar."""
+        """From rate_bar (all, or one that is 1) and memory_next_bar to theta_{t} and, stored, memory_bar."""
         out, top = self.out, len(self.net.stack) - 1
         for chunk in range(self.chunks):
             weights = {t: self._weight("out_w", t, chunk) for t in seeds}
@@ -254,7 +255,8 @@ class _Kernel:
                 tag = f"{layer}_{chunk}"
                 if with_memory:
                     first = None if self.lstm else f"kept_{tag}"
-                    self._times_rows(f"h_bar_out_{tag}", first, "hz" if not self.lstm else "z", f"back_{layer}", layer, chunk)
+                    kind = "z" if self.lstm else "hz"
+                    self._times_rows(f"h_bar_out_{tag}", first, kind, f"back_{layer}", layer, chunk)
                     stores.append((self._h(layer), chunk, f"h_bar_out_{tag}"))
                     if self.lstm:
                         stores.append((self._c(layer), chunk, f"c_bar_out_{tag}"))
@@ -334,8 +336,8 @@ class _Kernel:
             f'{banner}#include "{self.isa.header}" /* first: it sets the instruction set */\n\n'
             f'#include "thermal_net.h"\n\n{tables}\n{bodies}\n'
             f"const net_kernel_t net_{name} = {{\n"
-            f'    .name = "{name}",\n    .available = vec_available,\n    .forward = forward,\n    .adjoint = adjoint,\n'
-            f"    .slope = slope,\n}};\n"
+            f'    .name = "{name}",\n    .available = vec_available,\n    .forward = forward,\n'
+            f"    .adjoint = adjoint,\n    .slope = slope,\n}};\n"
         )
 
 

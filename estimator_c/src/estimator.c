@@ -10,6 +10,9 @@
 #define START_WAIT 20
 #define FALLBACK_WEIGHT 0.01 /* of a made-up prior: one measurement weighs a thousand times more */
 
+/* K^2: of a start from a measurement (the net's memory has yet to fill), and of one from nothing. */
+static const double KNOWN_VARIANCE = 10.0, UNKNOWN_VARIANCE = 900.0;
+static const double MOVING_RPM = 50.0, MOVING_NM = 5.0;
 static const double UPPER_SIGMA = 3.0;
 static const double MODEL_VARIANCE = 0.01; /* K^2: a plant that is not quite the one the net knows, see docs/estimator.md */
 static const double START_VARIANCE = 0.09; /* the same while the net's memory is still filling */
@@ -52,14 +55,26 @@ static void forget(estimator_t *self)
     }
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         self->innovation[ch] = NAN;
+        self->resume_degc[ch] = NAN;
         self->last_measured_tick[ch] = INT64_MIN / 2; /* never */
     }
 }
 
+/* Begin again, the same plant: what is known of the sensors stays known. */
 static void restart(estimator_t *self)
 {
+    sensor_monitor_t monitor[MHE_CHANNELS];
+    memcpy(monitor, self->fusion.monitor, sizeof monitor);
+    const bool started = self->started;
+    double last[MHE_CHANNELS] = {self->theta[0], self->theta[1]};
     self->counters.restarts++;
     forget(self);
+    for (int ch = 0; ch < MHE_CHANNELS && started; ch++) {
+        if (!monitor[ch].trusted) {
+            self->fusion.monitor[ch] = monitor[ch];
+            self->resume_degc[ch] = last[ch];
+        }
+    }
 }
 
 estimator_error_t estimator_init(estimator_t *self, const est_setting_t *setting)
@@ -90,9 +105,14 @@ static int64_t interval_of(const estimator_t *self, int64_t tick)
 }
 
 /* The plant started again, or so much is missing that the net's memory is worth nothing: begin at this frame. */
-static void restart_at(estimator_t *self, uint16_t tick16)
+static void restart_at(estimator_t *self, uint16_t tick16, bool same_plant)
 {
-    restart(self);
+    if (same_plant) {
+        restart(self);
+    } else {
+        self->counters.restarts++;
+        forget(self);
+    }
     self->motor_seen = true;
     self->newest_tick = tick16;
 }
@@ -126,7 +146,7 @@ static bool take_tick(estimator_t *self, uint16_t tick16)
     }
     self->tick_jumped = false;
     if (jumped || piled) {
-        restart_at(self, tick16);
+        restart_at(self, tick16, tick >= self->newest_tick);
     } else {
         self->newest_tick = tick;
     }
@@ -141,6 +161,9 @@ void estimator_feed_motor(estimator_t *self, uint16_t tick16, double torque_nm, 
     if (!valid || !usable(torque_nm) || !usable(speed_rpm)) {
         self->counters.invalid_inputs++;
         return;
+    }
+    if (fabs(speed_rpm) > MOVING_RPM || fabs(torque_nm) > MOVING_NM) {
+        offset_calibration_moving(&self->calibration);
     }
     if (!self->anchored || self->newest_tick <= self->grid_tick) {
         self->held_input[0] = speed_rpm; /* should the first interval stay without a frame */
@@ -157,10 +180,43 @@ void estimator_feed_motor(estimator_t *self, uint16_t tick16, double torque_nm, 
     bin->frames++;
 }
 
+/* A channel without any measurement starts at the other's temperature. Held firmly there while nothing else speaks for it
+ * (a problem with nothing to hold it converges slowly); but this prior says little, so that from the first measurement on,
+ * until a window is full of them, it weighs next to nothing. */
+static void fall_back(estimator_t *self, int ch)
+{
+    self->fallback_left[ch] = MHE_NODES;
+    self->fusion.mhe.weight_prior[ch] = self->setting.weight_arrival[ch];
+}
+
+static void fallback_measured(estimator_t *self, int ch)
+{
+    const bool last = --self->fallback_left[ch] == 0;
+    self->fusion.mhe.weight_prior[ch] = last ? self->setting.weight_prior[ch] : FALLBACK_WEIGHT;
+    self->fusion.mhe.weight_arrival[ch] = last ? self->setting.weight_arrival[ch] : FALLBACK_WEIGHT;
+}
+
+/* A measurement for the newest node. */
+static void measure(estimator_t *self, int channel, double y)
+{
+    const double raw = y + self->calibration.result.offset_degc[channel];
+    self->innovation[channel] = fusion_measure(&self->fusion, channel, y, raw, &self->innovation_variance[channel]);
+    if (self->fallback_left[channel] > 0) {
+        fallback_measured(self, channel);
+    }
+}
+
 /* A measurement for node k: into the window if the node is there, else into the ring for when it comes. */
 static void place_measurement(estimator_t *self, int64_t k, int channel, double y)
 {
     const int64_t newest_node = self->next_interval - self->setting.delay_steps; /* of the MHE, if started */
+    if (self->started && k == newest_node && self->awaited[channel]) {
+        estimator_finish(self);
+        self->awaited[channel] = false;
+        measure(self, channel, y);
+        self->measurement_pending = true;
+        return;
+    }
     if (self->started && k <= newest_node) {
         const double raw = y + self->calibration.result.offset_degc[channel];
         const double innovation = fusion_measure_late(&self->fusion, (int)(newest_node - k), channel, y, raw);
@@ -190,8 +246,15 @@ static void reopen(estimator_t *self)
         self->measured[k][0] = NAN;
         self->measured[k][1] = NAN;
     }
+    memset(self->fallback_left, 0, sizeof self->fallback_left);
+    memset(self->awaited, 0, sizeof self->awaited);
     self->measurement_pending = false;
     self->started = false;
+}
+
+static bool in_range(const estimator_t *self, double raw)
+{
+    return raw >= self->setting.range_low_degc && raw <= self->setting.range_high_degc;
 }
 
 void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc, double theta_r_degc, bool w_valid,
@@ -199,7 +262,11 @@ void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc
 {
     const double *offset = self->calibration.result.offset_degc;
     const double y[MHE_CHANNELS] = {theta_w_degc - offset[0], theta_r_degc - offset[1]};
-    const bool valid[MHE_CHANNELS] = {w_valid && usable(theta_w_degc), r_valid && usable(theta_r_degc)};
+    bool valid[MHE_CHANNELS] = {w_valid && usable(theta_w_degc), r_valid && usable(theta_r_degc)};
+    if (!self->started && self->setting.supervise) { /* an open or shorted sensor is no temperature to start from */
+        valid[0] = valid[0] && in_range(self, theta_w_degc);
+        valid[1] = valid[1] && in_range(self, theta_r_degc);
+    }
     int64_t tick = self->motor_seen ? unwrap(self->newest_tick, tick16)
                    : self->anchored ? unwrap(self->newest_temp_tick, tick16)
                                     : tick16;
@@ -265,22 +332,6 @@ static void close_interval(estimator_t *self, int64_t k, bool *stale)
     *bin = (estimator_bin_t){0};
 }
 
-/* A channel without any measurement starts at the other's temperature. Held firmly there while nothing else speaks for it
- * (a problem with nothing to hold it converges slowly); but this prior says little, so that from the first measurement on,
- * until a window is full of them, it weighs next to nothing. */
-static void fall_back(estimator_t *self, int ch)
-{
-    self->fallback_left[ch] = MHE_NODES;
-    self->fusion.mhe.weight_prior[ch] = self->setting.weight_arrival[ch];
-}
-
-static void fallback_measured(estimator_t *self, int ch)
-{
-    const bool last = --self->fallback_left[ch] == 0;
-    self->fusion.mhe.weight_prior[ch] = last ? self->setting.weight_prior[ch] : FALLBACK_WEIGHT;
-    self->fusion.mhe.weight_arrival[ch] = last ? self->setting.weight_arrival[ch] : FALLBACK_WEIGHT;
-}
-
 /* Open the MHE's window at node k once each channel has a measurement to start from, or one of them and a long wait. */
 static bool start_at(estimator_t *self, int64_t k)
 {
@@ -294,10 +345,18 @@ static bool start_at(estimator_t *self, int64_t k)
     if (known == 0 || (known < MHE_CHANNELS && k < START_WAIT)) {
         return false;
     }
+    double variance[MHE_CHANNELS];
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        const double measured = prior[ch];
+        variance[ch] = KNOWN_VARIANCE;
         if (isnan(prior[ch])) {
             prior[ch] = prior[1 - ch];
+            variance[ch] = UNKNOWN_VARIANCE;
             fall_back(self, ch);
+        }
+        if (isfinite(self->resume_degc[ch])) { /* its sensor is not believed: go on from the last estimate */
+            prior[ch] = self->resume_degc[ch];
+            variance[ch] = isnan(measured) ? UNKNOWN_VARIANCE : KNOWN_VARIANCE;
         }
     }
     double memory[NET_MEMORY] = {0};
@@ -308,7 +367,7 @@ static bool start_at(estimator_t *self, int64_t k)
     for (int step = 0; step < self->setting.spin_up_steps && first >= 0; step++) {
         net_forward(self->input[slot(first)], prior, memory, memory, rate, tape);
     }
-    fusion_start(&self->fusion, prior, memory);
+    fusion_start(&self->fusion, prior, variance, memory);
     self->started = true;
     return true;
 }
@@ -331,11 +390,22 @@ static void measure_newest(estimator_t *self, int64_t k)
 {
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         const double y = self->measured[slot(k)][ch];
-        const double raw = y + self->calibration.result.offset_degc[ch];
         self->measured[slot(k)][ch] = NAN;
-        self->innovation[ch] = fusion_measure(&self->fusion, ch, y, raw, &self->innovation_variance[ch]);
-        if (!isnan(y) && self->fallback_left[ch] > 0) {
-            fallback_measured(self, ch);
+        self->awaited[ch] = isnan(y);
+        if (!isnan(y)) {
+            measure(self, ch, y);
+        }
+    }
+}
+
+/* The newest node's measurement has not come until the next one is due: now it counts as missing. */
+static void give_up_waiting(estimator_t *self)
+{
+    for (int ch = 0; ch < MHE_CHANNELS && self->started; ch++) {
+        if (self->awaited[ch]) {
+            double variance;
+            (void)fusion_measure(&self->fusion, ch, NAN, NAN, &variance);
+            self->awaited[ch] = false;
         }
     }
 }
@@ -381,6 +451,7 @@ static void consume_interval(estimator_t *self, estimator_out_t *out)
 {
     const int64_t k = self->next_interval;
     estimator_finish(self); /* several intervals in one step: each begins from a finished solution */
+    give_up_waiting(self);
     close_interval(self, k, &out->stale_input);
     self->next_interval = k + 1;
     out->intervals++;
@@ -446,7 +517,7 @@ static estimator_channel_t channel_now(const estimator_t *self, int ch, double t
     const double margin = fmin(MARGIN_MAX_DEGC, MARGIN_DEGC_S * beyond_s);
     return (estimator_channel_t){
         .fault = monitor->fault,
-        .trusted = self->fusion.share[ch] > 0.0,
+        .trusted = monitor->trusted && self->fusion.share[ch] > 0.0,
         .sigma_degc = sigma,
         .upper_degc = theta_degc + UPPER_SIGMA * sqrt(self->variance[ch] + model + offset_sigma * offset_sigma) + margin,
         .innov_sigma_degc = isnan(self->innovation[ch]) ? NAN : sqrt(self->innovation_variance[ch]),

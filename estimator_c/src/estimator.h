@@ -114,6 +114,8 @@ typedef struct {
     double memory[NET_MEMORY];
     validity_t validity;
     double innovation[MHE_CHANNELS];   /* not yet published */
+    bool awaited[MHE_CHANNELS];        /* the newest node's measurement may still come */
+    double resume_degc[MHE_CHANNELS];  /* after a restart: the last estimate of a channel whose sensor is not believed */
     double innovation_variance[MHE_CHANNELS];
     double variance[MHE_CHANNELS];     /* of theta, K^2 */
     bool measurement_pending;          /* a late measurement entered the window after its step */

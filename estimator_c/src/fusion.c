@@ -3,7 +3,8 @@
 #include <math.h>
 #include <string.h>
 
-static const double START_VARIANCE = 10.0;    /* K^2, where the prior says next to nothing */
+static const double FEEDBACK_KKT_DEGC = 1.0;  /* and what one sweep may leave to the next */
+static const double DOUBT_MAX = 10.0;         /* K^2, up to which doubt about the net adds */
 static const double CREEP_VARIANCE = 0.25;    /* K^2, of the slow observer's level */
 static const double USABLE_KKT_DEGC = 0.01;   /* an MHE cut short is still used below this */
 static const double DOUBT = 1.0;              /* K^2 per step, one half-width outside the envelope */
@@ -23,9 +24,9 @@ void fusion_init(fusion_t *self, const est_setting_t *setting)
     }
 }
 
-void fusion_start(fusion_t *self, const double prior[MHE_CHANNELS], const double memory[])
+void fusion_start(fusion_t *self, const double prior[MHE_CHANNELS], const double variance[MHE_CHANNELS],
+                  const double memory[])
 {
-    const double variance[MHE_CHANNELS] = {START_VARIANCE, START_VARIANCE};
     mhe_start(&self->mhe, prior, memory);
     ekf_start(&self->ekf, prior, variance, memory);
     slow_observer_start(&self->slow, prior, memory);
@@ -59,7 +60,7 @@ static void begin_at_oldest(fusion_t *self)
     const fusion_prediction_t *oldest = &self->predicted[(self->newest + 1) % MHE_NODES];
     double weight[MHE_CHANNELS];
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-        weight[ch] = 1.0 / oldest->variance[ch];
+        weight[ch] = fmax(self->setting.weight_prior[ch], 1.0 / oldest->variance[ch]);
     }
     mhe_arrival(&self->mhe, oldest->theta, weight, self->steps < MEMORY_STEPS ? oldest->memory : NULL);
 }
@@ -107,7 +108,8 @@ void fusion_doubt(fusion_t *self, double novelty)
     }
     const double beyond = fmin(novelty, NOVELTY_MAX) - 1.0;
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-        self->ekf.p[ch][ch] += DOUBT * beyond * beyond;
+        const double room = fmax(0.0, DOUBT_MAX - self->ekf.p[ch][ch]);
+        self->ekf.p[ch][ch] += fmin(room, DOUBT * beyond * beyond);
     }
 }
 
@@ -151,6 +153,9 @@ static double judge(fusion_t *self, int channel, double *y, double raw)
     }
     if (verdict.creep) {
         move_level(self, channel, self->slow.theta[channel] - now, CREEP_VARIANCE);
+    }
+    if (verdict.settled) {
+        slow_observer_shift(&self->slow, channel, now - self->slow.theta[channel]);
     }
     if (verdict.resume) {
         move_level(self, channel, verdict.level, self->ekf.r[channel] / 10.0);
@@ -208,7 +213,7 @@ static bool ekf_finite(const ekf_t *ekf)
 void fusion_solve(fusion_t *self, fusion_estimate_t *estimate)
 {
     mhe_result_t *result = &self->result;
-    const bool feedback = self->setting.mode == EST_MODE_FEEDBACK;
+    const bool feedback = self->setting.mode == EST_MODE_FEEDBACK && self->mhe.full; /* a young window needs more */
     *result = (mhe_result_t){.kkt_degc = NAN};
     *estimate = (fusion_estimate_t){.status = MHE_OK};
     bool solved = false;
@@ -216,7 +221,7 @@ void fusion_solve(fusion_t *self, fusion_estimate_t *estimate)
         set_loss_scale(self);
         estimate->status = feedback ? mhe_feedback(&self->mhe, result) : mhe_solve(&self->mhe, result);
         solved = estimate->status == MHE_OK ||
-                 (estimate->status == MHE_MAX_SWEEPS && (feedback || result->kkt_degc < USABLE_KKT_DEGC));
+                 (estimate->status == MHE_MAX_SWEEPS && result->kkt_degc < (feedback ? FEEDBACK_KKT_DEGC : USABLE_KKT_DEGC));
         self->unfinished = feedback && estimate->status == MHE_MAX_SWEEPS;
         estimate->status = self->unfinished ? MHE_OK : estimate->status;
     }

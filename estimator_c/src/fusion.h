@@ -53,8 +53,9 @@ typedef struct {
 /* Take a setting; nothing known. Never fails. */
 void fusion_init(fusion_t *self, const est_setting_t *setting);
 
-/* Begin at that temperature and memory of the net. Never fails. */
-void fusion_start(fusion_t *self, const double prior[MHE_CHANNELS], const double memory[]);
+/* Begin at that temperature, known to `variance` (K^2), and that memory of the net. Never fails. */
+void fusion_start(fusion_t *self, const double prior[MHE_CHANNELS], const double variance[MHE_CHANNELS],
+                  const double memory[]);
 
 /* One step of the net with u = [speed rpm, torque Nm]. Never fails. */
 void fusion_advance(fusion_t *self, const double u[2]);

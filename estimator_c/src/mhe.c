@@ -40,7 +40,8 @@ void mhe_init(mhe_t *self, const est_setting_t *setting)
     self->bound_weight = (real_t)setting->bound_weight;
     self->lower = (real_t)setting->lower_degc;
     self->upper = (real_t)setting->upper_degc;
-    self->tolerance = real_max((real_t)setting->tolerance_degc, TOLERANCE_FLOOR_DEGC);
+    const real_t tolerance = (real_t)setting->tolerance_degc;
+    self->tolerance = tolerance > 0 ? real_max(tolerance, TOLERANCE_FLOOR_DEGC) : 0;
     self->max_sweeps = setting->max_sweeps;
     self->newest_measurement = setting->newest_measurement;
 }

@@ -15,7 +15,8 @@ typedef enum {
     CALIBRATION_DATASHEET = 0, /* the setting's offset is in use */
     CALIBRATION_MEASURING = 1, /* key-on with the machine at coolant temperature: averaging */
     CALIBRATION_FROZEN = 2,    /* the measured offset is in use and stays */
-    CALIBRATION_REFUSED = 3,   /* measured, but not believable: the setting's offset stays in use */
+    CALIBRATION_REFUSED = 3,   /* measured, but of at least one sensor not believable: its datasheet offset stays in use, its
+                                * uncertainty is as large as what was measured */
 } calibration_state_t;
 
 /* What is being subtracted. */
@@ -28,6 +29,7 @@ typedef struct {
 typedef struct {
     bool enabled, soaked;
     double datasheet_degc, coolant_degc;
+    int32_t age;               /* values since the last coolant temperature */
     int32_t wait;              /* values still to pass: they speak for the time before key-on */
     int32_t count[CALIBRATION_CHANNELS];
     double mean[CALIBRATION_CHANNELS], m2[CALIBRATION_CHANNELS];
@@ -39,9 +41,12 @@ typedef struct {
 void offset_calibration_init(offset_calibration_t *self, double datasheet_degc, double sigma_degc, int32_t delay_steps,
                              bool enabled);
 
-/* Coolant temperature, and whether the machine has soaked and stands still. The end of the soak before ten seconds of
- * values ends the calibration without a result. */
+/* Coolant temperature (NAN: none, ignored), and whether the machine has soaked. The end of the soak, or 2.5 s without a coolant
+ * temperature, before ten seconds of values ends the calibration without a result. */
 void offset_calibration_coolant(offset_calibration_t *self, double coolant_degc, bool soaked);
+
+/* The machine turns or gives torque: a calibration under way ends without a result. */
+void offset_calibration_moving(offset_calibration_t *self);
 
 /* Values as the sensors gave them (NAN: none). True: the offset has just changed. */
 bool offset_calibration_measure(offset_calibration_t *self, const double raw[CALIBRATION_CHANNELS]);

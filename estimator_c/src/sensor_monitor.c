@@ -6,10 +6,18 @@
 static const int32_t REBASE = 20;            /* values that give the size of a step */
 static const double REBASED_SHARE = 0.005;    /* of a value's weight afterwards: followed over ten seconds */
 static const int32_t REBASE_HOLD = 1200;     /* steps, 2 min: later the net alone knows better than a step measured then */
+static const int32_t RELAPSE = 600;          /* steps: distrusted again within a minute */
+static const int32_t RELAPSES_MAX = 4;
+static const int32_t NOISE_QUIET = 50;       /* steps without noise that end it */
+static const double GAINED_DEGC_S = 0.05, GAINED_MAX_DEGC = 10.0; /* as the upper bound grows */
+static const double GAINED_OFFSET = 0.25;    /* of a step's size */
+static const double CREEP_MAX_DEGC = 3.0;
+static const double PLAUSIBLE_VARIANCE = 10.0; /* K^2 */
 static const double STEP_S = 0.1;
 static const int32_t MISSING_LIMIT = 3;      /* values in a row: one or two may be late on the bus, or spikes */
 static const int32_t SPIKE_HOLD = 10;        /* 1 s */
-static const double EQUAL_USUAL = 0.1;       /* a sensor that repeats itself this often has no noise to go by */
+static const double EQUAL_MEMORY = 0.02;     /* 5 s */
+static const double EQUAL_USUAL = 0.2;       /* a sensor that repeats itself this often has no noise to go by */
 static const double STUCK_MOVE_DEGC = 1.0;   /* then: how far the prediction must have moved meanwhile */
 static const double NOISE_ON = 3.0;          /* spread over what it should be */
 static const double NOISE_WORTH = 2.0;       /* the net errs more slowly than the noise it is modelled by: measured */
@@ -37,6 +45,8 @@ void sensor_monitor_init(sensor_monitor_t *self, const est_setting_t *setting, i
     self->range_low = setting->range_low_degc;
     self->range_high = setting->range_high_degc;
     self->trusted = true;
+    self->ordinary_r = NOISE_ON * NOISE_ON * self->r;
+    self->equal_share = 1.0; /* until it has shown that it scatters */
     self->last_y = NAN;
 }
 
@@ -74,19 +84,23 @@ static double level_of(const sensor_monitor_t *self, int n, double *spread)
     return middle;
 }
 
-static void remember(sensor_monitor_t *self, double residual, double variance)
+static void remember(sensor_monitor_t *self, double residual)
 {
     self->residual[self->next] = residual;
-    self->variance[self->next] = variance;
     self->next = (self->next + 1) % MONITOR_HISTORY;
     self->count += self->count < MONITOR_HISTORY;
 }
 
 static void distrust(sensor_monitor_t *self, sensor_class_t fault)
 {
+    const bool creeps = fault == SENSOR_DRIFT || fault == SENSOR_SLOW;
     if (self->trusted) {
         self->distrusted_steps = 0;
+        self->ordinary_r = fmax(NOISE_ON * NOISE_ON * self->r, NOISE_OFF * NOISE_OFF * self->spread_r);
+        self->relapses = creeps && self->trusted_steps < RELAPSE ? self->relapses + (self->relapses < RELAPSES_MAX) : 0;
     }
+    memset(self->pending, 0, sizeof self->pending); /* what a faulty sensor does is not what is usual */
+    self->run = 0;
     self->trusted = false;
     self->fault = fault;
     self->since_change = 0;
@@ -100,6 +114,7 @@ static void distrust(sensor_monitor_t *self, sensor_class_t fault)
 static void trust(sensor_monitor_t *self)
 {
     self->trusted = true;
+    self->trusted_steps = 0;
     self->fault = SENSOR_OK;
     self->run = 0;
     self->last_inside = 0.0;
@@ -140,6 +155,9 @@ static bool is_drift(sensor_monitor_t *self, const monitor_input_t *in)
     const double size = fabs(in->slow);
     const bool found = self->steps > WARM_UP && size > fmax(self->drift, DRIFT_USUAL * self->usual);
     double *pending = self->pending;
+    if (found || self->fault != SENSOR_OK) {
+        return found;
+    }
     pending[0] = fmax(pending[0], size);
     if (++self->steps % USUAL_BLOCK == 0) {
         self->usual = fmax(USUAL_KEEP * self->usual, pending[MONITOR_PENDING - 1]);
@@ -172,8 +190,8 @@ static bool is_stuck(sensor_monitor_t *self, const monitor_input_t *in)
         self->equal++;
     }
     self->last_y = in->y;
-    if (self->trusted && self->equal < MONITOR_RUN) {
-        self->equal_share += 0.005 * ((same ? 1.0 : 0.0) - self->equal_share);
+    if (self->equal < MONITOR_RUN) {
+        self->equal_share += EQUAL_MEMORY * ((same ? 1.0 : 0.0) - self->equal_share);
     }
     const bool silent = self->equal_share > EQUAL_USUAL;
     return self->equal >= MONITOR_RUN - 1 && (!silent || fabs(prediction - self->run_prediction) > STUCK_MOVE_DEGC);
@@ -186,19 +204,23 @@ static monitor_verdict_t judge_trusted(sensor_monitor_t *self, const monitor_inp
     const double level = level_of(self, MONITOR_SPREAD, &spread);
     const bool noisy = self->fault == SENSOR_NOISE;
     const double usual = sqrt(self->r + in->variance);
+    bool settled = false;
     if (!noisy && self->count >= 10 && spread > NOISE_ON * usual) {
         self->fault = SENSOR_NOISE;
         self->spread_r = spread * spread;
     } else if (noisy) {
         self->spread_r = fmax(self->r, self->spread_r + 0.05 * (spread * spread - self->spread_r));
-        if (self->count == MONITOR_HISTORY && spread < NOISE_OFF * usual) {
+        self->quiet = spread < NOISE_OFF * usual ? self->quiet + 1 : 0;
+        if (self->count == MONITOR_HISTORY && self->quiet >= NOISE_QUIET) {
+            self->quiet = 0;
+            settled = true;
             self->fault = SENSOR_OK;
             self->spread_r = self->r;
         }
     }
     const double sigma = sqrt(self->spread_r + in->variance);
     const double share = self->fault == SENSOR_NOISE ? fmin(1.0, NOISE_WORTH * self->r / self->spread_r) : 1.0;
-    if (self->fault == SENSOR_NOISE && self->count >= 10 && fabs(level) > 1.3 * spread && fabs(level) > 4.0 * usual) {
+    if (self->fault == SENSOR_NOISE && self->count >= 10 && fabs(level) > 1.3 * fmax(spread, sqrt(self->spread_r)) && fabs(level) > 4.0 * usual) {
         distrust(self, SENSOR_OFFSET);
         return (monitor_verdict_t){.forget = 10};
     }
@@ -229,11 +251,11 @@ static monitor_verdict_t judge_trusted(sensor_monitor_t *self, const monitor_inp
     }
     const bool slow = is_slow(self, in);
     const bool drift = is_drift(self, in);
-    if (self->fault == SENSOR_OK && (slow || drift)) {
+    if (self->fault == SENSOR_OK && !settled && (slow || drift)) {
         distrust(self, slow ? SENSOR_SLOW : SENSOR_DRIFT);
         return (monitor_verdict_t){.forget = MONITOR_HISTORY, .creep = true};
     }
-    return (monitor_verdict_t){.share = outside ? 0.0 : share};
+    return (monitor_verdict_t){.share = outside ? 0.0 : share, .settled = settled};
 }
 
 static int32_t calm_needed(const sensor_monitor_t *self)
@@ -241,7 +263,7 @@ static int32_t calm_needed(const sensor_monitor_t *self)
     switch (self->fault) {
     case SENSOR_DRIFT:
     case SENSOR_SLOW:
-        return CALM_CREEP;
+        return CALM_CREEP << (self->relapses > 1 ? self->relapses - 1 : 0); /* a late sensor agrees wherever the temperature is level */
     case SENSOR_OFFSET:
         return CALM_STEP;
     default:
@@ -274,6 +296,23 @@ static monitor_verdict_t judge_stepped(sensor_monitor_t *self, const monitor_inp
     return (monitor_verdict_t){.share = self->run > 0 ? 0.0 : REBASED_SHARE, .offset = self->offset};
 }
 
+/* How far a sound sensor may stand from the prediction: what the filter says of itself, and what a plant that is not the net's
+ * may have gained on the net meanwhile. A step or a creep must not slip in that way: they leave less room. */
+static double plausible_level(const sensor_monitor_t *self, const monitor_input_t *in)
+{
+    const double filter = PLAUSIBLE_DEGC + 3.0 * sqrt(fmin(in->variance, PLAUSIBLE_VARIANCE));
+    const double gained = fmin(GAINED_MAX_DEGC, GAINED_DEGC_S * STEP_S * self->distrusted_steps);
+    switch (self->fault) {
+    case SENSOR_DRIFT:
+    case SENSOR_SLOW:
+        return fmin(CREEP_MAX_DEGC, CREEP_DEGC + CREEP_DEGC_S * STEP_S * self->distrusted_steps);
+    case SENSOR_OFFSET:
+        return filter + fmin(gained, GAINED_OFFSET * fabs(self->offset));
+    default:
+        return filter + gained;
+    }
+}
+
 /* A value of a sensor that is not believed: has it come back? */
 static monitor_verdict_t judge_distrusted(sensor_monitor_t *self, const monitor_input_t *in)
 {
@@ -281,11 +320,16 @@ static monitor_verdict_t judge_distrusted(sensor_monitor_t *self, const monitor_
     double spread;
     const double level = level_of(self, MONITOR_HISTORY, &spread);
     const bool crept = self->fault == SENSOR_DRIFT || self->fault == SENSOR_SLOW;
-    const double plausible = crept ? CREEP_DEGC + CREEP_DEGC_S * STEP_S * self->distrusted_steps
-                                   : PLAUSIBLE_DEGC + 3.0 * sqrt(in->variance);
-    if (spread > NOISE_OFF * sqrt(self->r) || fabs(level) > plausible ||
-        fabs(in->residual - level) > self->gate * usual) {
+    const double plausible = plausible_level(self, in);
+    const double scatter2 = crept ? NOISE_OFF * NOISE_OFF * self->r : self->ordinary_r;
+    const bool calm = spread * spread <= scatter2 && fabs(in->residual - level) <= self->gate * fmax(usual, spread);
+    if (!calm || fabs(level) > plausible) {
         self->since_change = 0;
+    }
+    const bool back = self->fault == SENSOR_DROPOUT || self->fault == SENSOR_STUCK;
+    self->elsewhere = back && calm && fabs(level) > plausible ? self->elsewhere + 1 : 0;
+    if (self->elsewhere >= CALM_STEP) { /* values again, but far away: that is an offset */
+        distrust(self, SENSOR_OFFSET);
     }
     if (self->since_change < calm_needed(self)) {
         return self->fault == SENSOR_OFFSET ? judge_stepped(self, in) : (monitor_verdict_t){0};
@@ -297,6 +341,7 @@ static monitor_verdict_t judge_distrusted(sensor_monitor_t *self, const monitor_
 monitor_verdict_t sensor_monitor_step(sensor_monitor_t *self, const monitor_input_t *in)
 {
     self->distrusted_steps += !self->trusted;
+    self->trusted_steps += self->trusted;
     const bool out_of_range = in->raw < self->range_low || in->raw > self->range_high;
     if (!isfinite(in->y) || out_of_range) {
         return absent(self);
@@ -307,7 +352,7 @@ monitor_verdict_t sensor_monitor_step(sensor_monitor_t *self, const monitor_inpu
         distrust(self, SENSOR_STUCK);
         return (monitor_verdict_t){.forget = news ? MONITOR_RUN : 0};
     }
-    remember(self, in->residual, in->variance);
+    remember(self, in->residual);
     self->since_change++;
     return self->trusted ? judge_trusted(self, in) : judge_distrusted(self, in);
 }

@@ -41,6 +41,7 @@ typedef struct {
     int32_t forget;        /* values before this one that turned out to be worth nothing */
     bool resume;           /* believed again: take the sensor's level */
     double level;          /* resume: how far the sensor stands above the prediction, degC */
+    bool settled;          /* noise has ended: the slow observer, led astray by it, goes to the estimate's level */
     bool creep;            /* drift or lag found: the estimate has followed it, take the slow observer's level */
 } monitor_verdict_t;
 
@@ -52,10 +53,13 @@ typedef struct {
     sensor_class_t fault;  /* as published */
     bool trusted;
     double spread_r;       /* noise: variance as seen, K^2; else r */
-    int32_t distrusted_steps;
+    int32_t distrusted_steps, trusted_steps; /* since trust was lost, and since it came back */
+    int32_t relapses;      /* creeping faults found soon after one had ended */
+    int32_t quiet;         /* noise: steps without */
+    int32_t elsewhere;     /* dropout, stuck: calm values far from the prediction, in a row */
+    double ordinary_r;     /* scatter^2 that was ordinary before trust was lost, K^2 */
 
     double residual[MONITOR_HISTORY]; /* ring of the newest values' residuals */
-    double variance[MONITOR_HISTORY];
     int32_t count, next;
     int32_t since_change;  /* values taken since trust was lost or the level was last out */
     int32_t since_step;    /* offset: values since then */

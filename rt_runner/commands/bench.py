@@ -12,8 +12,9 @@ def _add_solver(parts) -> None:
     p = parts.add_parser(
         "solver",
         help="every solver of the estimator's problem on the same recorded steps",
-        description="Time, instructions, error against ipopt and memory of the estimator's solver (vector kernels, portable C, "
-        "float), of SQP with HPIPM in several forms, and of ipopt, on more than 20 000 recorded steps, in turns, on one core.",
+        description="Time, instructions, error against ipopt and memory of the estimator's solver (vector kernels, "
+        "portable C, float), of SQP with HPIPM in several forms, and of ipopt, on more than 20 000 recorded steps, in "
+        "turns, on one core.",
     )
     p.add_argument("--backend", metavar="A,B", help="simd, portable, portable_f32, hpipm_ocp, … (default: all)")
     p.add_argument("--steps", type=int, metavar="N", help="about so many recorded steps (default: all)")

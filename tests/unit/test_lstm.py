@@ -28,7 +28,8 @@ Sequence = Callable[[NetWeights, Path, np.ndarray], tuple[np.ndarray, np.ndarray
 
 
 NETS = {  # cell, layers, cells per layer
-    "lstm 4": ("lstm", 1, 4), "lstm 3": ("lstm", 1, 3), "lstm 12": ("lstm", 1, 12), "lstm 16": ("lstm", 1, 16), "lstm 32": ("lstm", 1, 32),
+    "lstm 4": ("lstm", 1, 4), "lstm 3": ("lstm", 1, 3), "lstm 12": ("lstm", 1, 12),
+    "lstm 16": ("lstm", 1, 16), "lstm 32": ("lstm", 1, 32),
     "lstm 2x8": ("lstm", 2, 8), "gru 8": ("gru", 1, 8), "gru 2x5": ("gru", 2, 5),
 }  # fmt: skip
 
@@ -158,7 +159,8 @@ def test_generated_c_is_clean(net_path: Path, tmp_path: Path) -> None:
     base = ROOT / "estimator_c" / "src"
     for source in (*sorted(tmp_path.glob("*.c")), base / "mhe.c", base / "estimator.c"):
         includes = [f"-I{base}", f"-I{base / 'solver'}", f"-I{tmp_path}"]
-        subprocess.run(["gcc", *strict, *includes, "-O1", "-c", "-o", str(tmp_path / "object.o"), str(source)], check=True)
+        target = ["-O1", "-c", "-o", str(tmp_path / "object.o")]
+        subprocess.run(["gcc", *strict, *includes, *target, str(source)], check=True)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

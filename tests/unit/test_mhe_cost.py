@@ -1,7 +1,8 @@
 """The step's instruction count: bounded, the same whatever the data, and within 1 % of the committed one.
 
-No clock is involved, so it can gate. A change that moves it on purpose: RT_UPDATE_BASELINE=1 pytest tests/unit/test_mhe_cost.py
-writes the new count into mhe_instructions.json; commit that and say why.
+No clock is involved, so it can gate. A change that moves it on purpose:
+RT_UPDATE_BASELINE=1 .venv/bin/python -m pytest tests/unit/test_mhe_cost.py writes the new count into
+mhe_instructions.json; commit that and say why.
 """
 
 from __future__ import annotations

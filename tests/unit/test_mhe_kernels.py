@@ -12,9 +12,9 @@ import pytest
 
 from estimator_c.formulation.generate import generate
 from estimator_c.formulation.mhe import MheOracle, MheProblem
-from estimator_c.formulation.real import FLOAT
+from estimator_c.formulation.real import FLOAT, REALS
 from estimator_c.formulation.weights import NetWeights, load_weights
-from tests.support.libest import NODES, ROOT, SETTINGS, SOLVER, WEIGHTS, Lib, Mhe, Setting, compile_library
+from tests.support.libest import NODES, ROOT, SETTINGS, SOLVER, WEIGHTS, Lib, Setting, compile_library
 from tests.support.mhe_recorder import Record, Recorder, record
 
 AGREEMENT_DEGC = 1e-6
@@ -223,7 +223,7 @@ def test_state_is_small(tmp_path: Path) -> None:
     """16 kB in double precision, 8 in single."""
     for kind, limit in (("double", 16_384), ("float", 8_192)):
         folder = tmp_path / kind
-        subprocess.run(_generate_command(folder, kind), cwd=ROOT, check=True)
+        generate(WEIGHTS, SETTINGS, folder, REALS[kind])
         program = folder / "size.c"
         program.write_text('#include <stdio.h>\n#include "mhe.h"\nint main(void){printf("%zu", sizeof(mhe_t));}\n')
         src = ROOT / "estimator_c" / "src"
@@ -233,15 +233,8 @@ def test_state_is_small(tmp_path: Path) -> None:
         assert limit // 2 < size <= limit
 
 
-def _generate_command(folder: Path, kind: str) -> list[str]:
-    import sys
-
-    command = [sys.executable, "-m", "estimator_c.formulation.generate", "--weights", str(WEIGHTS)]
-    return [*command, "--settings", str(SETTINGS), "--out", str(folder), "--real", kind]
-
-
 def test_no_undefined_behaviour_in_any_kernel(tmp_path: Path) -> None:
-    """A drive under AddressSanitizer and UndefinedBehaviorSanitizer with each kernel, nets of short vectors included."""
+    """A drive under AddressSanitizer and UndefinedBehaviorSanitizer with each kernel, short vectors included."""
     from tests.support.nets import random_net
 
     base = ROOT / "estimator_c"

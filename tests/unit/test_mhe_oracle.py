@@ -21,7 +21,7 @@ from tests.support.libest import NODES, WEIGHTS, Lib, Mhe, compile_library
 from tests.support.mhe_recorder import Record, Recorder, record
 
 AGREEMENT_DEGC = 1e-6
-TIGHT = {"tolerance_degc": 1e-9, "max_sweeps": 60, "loss": 0}  # the quadratic loss: the robust ones are in test_mhe_robust.py
+TIGHT = {"tolerance_degc": 1e-9, "max_sweeps": 60, "loss": 0}  # robust ones: test_mhe_kernels.py
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The net's own sigmoid and tanh, portable in both number types and on vectors: error over the whole range, ends, NaN."""
+"""The net's own sigmoid and tanh, portable in both number types and on vectors: error everywhere, ends, NaN."""
 
 from __future__ import annotations
 
@@ -17,7 +17,13 @@ from estimator_c.formulation.real import GATE_ERROR, REALS
 from tests.support.libest import ROOT, SETTINGS, WEIGHTS
 
 LN2 = np.log(np.longdouble(2))
-PORTABLE = '#include "real.h"\nvoid gates(real_t a[], int n);\nvoid gates(real_t a[], int n)\n{\n    net_gates(a, n);\n}\n'
+PORTABLE = """#include "real.h"
+void gates(real_t a[], int n);
+void gates(real_t a[], int n)
+{
+    net_gates(a, n);
+}
+"""
 VECTOR = """#include "simd/vec_{0}.h"
 int usable(void);
 void gates(double a[], int n);
@@ -58,7 +64,8 @@ def build(kind: str, folder: Path) -> ct.CDLL:
     strict = ["-std=c11", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-shared", "-fPIC"]
     includes = [f"-I{folder}", f"-I{ROOT / 'estimator_c' / 'src'}"]
     subprocess.run(["gcc", *strict, *includes, "-o", str(folder / "gates.so"), str(source)], check=True)
-    undefined = subprocess.run(["nm", "-uD", str(folder / "gates.so")], capture_output=True, text=True, check=True).stdout
+    listed = ["nm", "-uD", str(folder / "gates.so")]
+    undefined = subprocess.run(listed, capture_output=True, text=True, check=True).stdout
     assert "exp" not in undefined
     assert "GLIBC" not in undefined.replace("__cxa_finalize@GLIBC_2.2.5", "")  # nothing of libm or libc
     return ct.CDLL(str(folder / "gates.so"))

@@ -27,8 +27,14 @@ def values(count: int, seed: int = 0, offset: np.ndarray = OFFSET, sigma: float 
     return COOLANT_DEGC + offset + np.random.default_rng(seed).normal(0.0, sigma, (count, 2))
 
 
-def feed(calib: OffsetCalibration, rows: np.ndarray) -> list[bool]:
-    return [calib.measure(*row) for row in rows]
+def feed(calib: OffsetCalibration, rows: np.ndarray, fresh: bool = True) -> list[bool]:
+    """All rows; while it measures, the coolant's temperature once a second."""
+    changed = []
+    for k, row in enumerate(rows):
+        if fresh and k % 10 == 0 and calib.result.state == MEASURING:
+            calib.coolant(COOLANT_DEGC, True)
+        changed.append(calib.measure(*row))
+    return changed
 
 
 def test_before_anything_the_datasheet_counts() -> None:
@@ -75,14 +81,30 @@ def test_sigma_is_as_large_as_the_errors() -> None:
     ids=["winding far off", "rotor far off", "noisy", "never soaked"],
 )
 def test_what_cannot_be_is_refused(offset: tuple[float, float], sigma: float) -> None:
-    """The datasheet stays in use, for both channels: a machine that has not soaked shows in one first."""
+    """The datasheet stays in use for the sensor concerned, as uncertain as what was measured; the other is calibrated."""
     calib = calibration()
     calib.coolant(COOLANT_DEGC, True)
-    assert not any(feed(calib, values(DELAY + VALUES, 1, np.array(offset), sigma)))
+    rows = values(DELAY + VALUES, 1, np.array(offset), sigma)
+    refused = np.array([abs(o + 1.0) > 5.0 or sigma > 1.0 for o in offset])
+    assert any(feed(calib, rows)) == (not refused.all())
     found = calib.result
     assert found.state == REFUSED
-    np.testing.assert_array_equal(found.offset_degc, [-1.0, -1.0])
-    np.testing.assert_array_equal(found.sigma_degc, [0.2, 0.2])
+    away = np.abs(rows[DELAY:].mean(axis=0) - COOLANT_DEGC + 1.0)
+    for ch in range(2):
+        if refused[ch]:
+            assert found.offset_degc[ch] == -1.0
+            assert found.sigma_degc[ch] == pytest.approx(max(0.2, away[ch]))
+        else:
+            assert found.offset_degc[ch] == pytest.approx(offset[ch], abs=0.2)
+            assert found.sigma_degc[ch] < 0.08
+
+
+def test_coolant_temperatures_that_stop_end_it() -> None:
+    calib = calibration()
+    calib.coolant(COOLANT_DEGC, True)
+    assert not any(feed(calib, values(DELAY + VALUES), fresh=False))
+    assert calib.result.state == DATASHEET
+    assert not any(feed(calib, values(DELAY + VALUES)))
 
 
 def test_a_channel_without_values_keeps_it_waiting_and_the_end_of_the_soak_ends_it() -> None:

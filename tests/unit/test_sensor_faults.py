@@ -71,7 +71,7 @@ WINDING = {
         f"{kind} {severity}": expected
         for kind in ("F4", "F4-open", "F4-short")
         for severity, expected in {
-            "mild": Expected((DROPOUT,), 0.75, STEP_S, 0.1, 0.15, 4.0),
+            "mild": Expected((DROPOUT,), 0.65, STEP_S, 0.1, 0.15, 4.0),
             "paper": Expected((DROPOUT,), 0.95, STEP_S, 0.12, 0.2, 4.0),
             "severe": Expected((DROPOUT,), 0.98, STEP_S, 0.5, 1.0, 7.0),
         }.items()
@@ -86,8 +86,8 @@ WINDING = {
     "F7 paper": Expected((DRIFT, SLOW), 0.85, 10.0, 1.0, 1.5, 20.0, above_degc=0.55),
     "F7 severe": Expected((DRIFT, SLOW), 0.85, 10.0, 1.0, 1.8, 20.0, above_degc=0.75),
     "F8 mild": Expected((), 0.0, 0.0, 0.28, 0.6, 0.0),
-    "F8 paper": Expected((SLOW, DRIFT), 0.3, 25.0, 1.15, 1.6, 20.0, above_degc=0.75),
-    "F8 severe": Expected((OFFSET, SLOW, DRIFT), 0.8, STEP_S, 0.8, 2.1, 20.0, above_degc=1.1),
+    "F8 paper": Expected((SLOW, DRIFT), 0.3, 25.0, 1.15, 1.6, 30.0, above_degc=0.75),
+    "F8 severe": Expected((OFFSET, SLOW, DRIFT), 0.8, STEP_S, 1.0, 2.1, 30.0, above_degc=1.1),
     "F9 mild": Expected((OFFSET, DRIFT), 0.9, 4.0, 0.65, 1.1, 10.0),  # a reading shows it one sensor delay later
     "F9 paper": Expected((OFFSET, DRIFT), 0.9, 4.0, 0.9, 1.4, 10.0),
     "F9 severe": Expected((OFFSET, DRIFT), 0.9, 4.0, 1.4, 2.1, 10.0),
@@ -103,7 +103,7 @@ ROTOR = {
     **{
         f"{kind} {severity}": Expected((DROPOUT,), share, STEP_S, 0.15, 0.2, 4.0)
         for kind in ("F4", "F4-open", "F4-short")
-        for severity, share in (("mild", 0.75), ("paper", 0.95), ("severe", 0.98))
+        for severity, share in (("mild", 0.65), ("paper", 0.95), ("severe", 0.98))
     },
     "F5 paper": Expected((SPIKE,), 0.1, 30.0, 0.06, 0.15, 2.0),
     "F6 mild": Expected((DRIFT,), 0.1, 60.0, 1.8, 2.8, 200.0, above_degc=1.9),  # believed again too soon, and again

@@ -1,1 +1,1 @@
-"""Solvers of the MHE problem behind one interface, a recorded stream of problems, and the oracle: for `bench solver`."""
+"""Solvers of the MHE problem behind one interface, recorded problems, and the oracle: for `bench solver`."""

@@ -33,11 +33,13 @@ def build_mhe(weights: Path, folder: Path, real: Real = DOUBLE) -> Path:
     """The estimator's own MHE, compiled as the product is (-O2), with every kernel there is for this type."""
     generated, base = folder / f"gen_{real.c_type}", ROOT / "estimator_c" / "src"
     library = folder / f"libmhe_{real.c_type}.so"
-    sources = [p for p in generate(weights, SETTINGS, generated, real) if p.suffix == ".c" and "envelope" not in p.name]
-    sources += [*sorted(base.glob("mhe*.c")), *sorted((base / "solver").glob("*.c")), HERE / "mhe_backend.c"]
+    written = generate(weights, SETTINGS, generated, real)
+    sources = [p for p in written if p.suffix == ".c" and "envelope" not in p.name]
+    sources += [*sorted(base.glob("mhe*.c")), *sorted((base / "solver").glob("*.c"))]
+    sources.append(HERE / "mhe_backend.c")
     _gcc([
-        "-O2", "-g", "-fPIC", "-shared", "-fno-math-errno", "-Wall", "-Wextra", "-Werror", f"-I{base}", f"-I{base / 'solver'}",
-        f"-I{generated}", f"-I{HERE}", *map(str, sources), "-o", str(library), "-lm",
+        "-O2", "-g", "-fPIC", "-shared", "-fno-math-errno", "-Wall", "-Wextra", "-Werror",
+        f"-I{base}", f"-I{base / 'solver'}", f"-I{generated}", f"-I{HERE}", *map(str, sources), "-o", str(library), "-lm",
     ])  # fmt: skip
     return library
 
@@ -50,7 +52,7 @@ def build_hpipm(weights: Path, folder: Path) -> Path:
     BuildError
         The wheel has no HPIPM, or its headers do not compile.
     """
-    wheel = Path(ca.__file__).parent
+    wheel = Path(str(ca.__file__)).parent
     for needed in ("libhpipm.so", "libblasfeo.so", "include/hpipm_d_ocp_qp_ipm.h"):
         if not (wheel / needed).exists():
             raise BuildError(f"the casadi wheel has no {needed}: install a casadi wheel of 3.6.7 or later from PyPI")
@@ -72,8 +74,6 @@ def build_hpipm(weights: Path, folder: Path) -> Path:
 
 
 def _gcc(arguments: list[str]) -> None:
-    done = subprocess.run(
-        ["gcc", "-std=c11", "-D_GNU_SOURCE", *arguments], capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(["gcc", "-std=c11", "-D_GNU_SOURCE", *arguments], capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise BuildError(f"gcc failed: {done.stderr.strip() or 'no word'}")

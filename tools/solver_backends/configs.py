@@ -86,6 +86,8 @@ def chosen(names: Sequence[str] | None) -> tuple[tuple[Config, ...], bool]:
     known = {c.name for c in CONFIGS}
     for name in names:
         if name not in known | {"oracle", "best_hpipm"}:
-            raise UnknownBackend(f"no backend '{name}': choose from {', '.join([*(c.name for c in CONFIGS), 'oracle'])}")
+            raise UnknownBackend(
+                f"no backend '{name}': choose from {', '.join([*(c.name for c in CONFIGS), 'oracle'])}"
+            )
     wanted = set(names) | (set(HPIPM_NAMES) if "best_hpipm" in names else set())
     return tuple(c for c in CONFIGS if c.name in wanted), "oracle" in names

@@ -1,15 +1,16 @@
-"""How fast the θ-space iteration contracts, measured on nets of every size: `python -m tools.solver_backends.contraction`.
+"""How fast the θ-space iteration contracts, measured on nets of every size.
 
     python -m tools.solver_backends.contraction [--doc docs/solver.md] WEIGHTS.json ...
 
-Each net drives its own recorded drive (with process and sensor noise, driven hard), and the C's MHE follows it. In every step the
-solver is asked for one sweep at a time; the change in °C that a sweep asks for, over the one before, is the contraction. Changes
-below 1e-9 °C are rounding and left out.
+Each net drives its own recorded drive (with process and sensor noise, driven hard), and the C's MHE follows it. In every
+step the solver is asked for one sweep at a time; the change in °C that a sweep asks for, over the one before, is the
+contraction. Changes below 1e-9 °C are rounding and left out.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,7 +33,7 @@ ROUNDING_DEGC = 1e-9
 
 @dataclass(frozen=True)
 class Contraction:
-    """Of one net: ratio of successive changes (median, largest), over the steps of a drive; sweeps to 1e-6 °C (mean, largest)."""
+    """Of one net, over a drive: ratio of successive changes (median, largest); sweeps to 1e-6 °C (mean, largest)."""
 
     net: str
     name: str
@@ -61,7 +62,7 @@ def contraction_of(path: Path, loss: int = 0, steps: int = STEPS) -> Contraction
         if step < 16:
             continue  # the growing window
         counted = [c for c in changes if c > ROUNDING_DEGC]
-        ratios += [b / a for a, b in zip(counted, counted[1:], strict=False)]
+        ratios += [b / a for a, b in itertools.pairwise(counted)]
         sweeps.append(next((k + 1 for k, c in enumerate(changes) if c <= 1e-6), SWEEPS))
     return Contraction(
         describe(weights), path.stem, float(np.median(ratios)), float(max(ratios)), float(np.mean(sweeps)), max(sweeps)
@@ -75,9 +76,13 @@ def _changes(mhe: Mhe) -> list[float]:
 
 def markdown(found: Sequence[Contraction]) -> str:
     """A table."""
-    lines = ["| net | file | contraction, median | largest | sweeps to 1e-6 °C, mean | most |", "|---|---|---:|---:|---:|---:|"]
+    lines = [
+        "| net | file | contraction, median | largest | sweeps to 1e-6 °C, mean | most |",
+        "|---|---|---:|---:|---:|---:|",
+    ]
     lines += [
-        f"| {c.net} | `{c.name}` | {c.median:.1e} | {c.largest:.1e} | {c.sweeps_mean:.1f} | {c.sweeps_max} |" for c in found
+        f"| {c.net} | `{c.name}` | {c.median:.1e} | {c.largest:.1e} | {c.sweeps_mean:.1f} | {c.sweeps_max} |"
+        for c in found
     ]
     return "\n".join(lines)
 
@@ -85,7 +90,9 @@ def markdown(found: Sequence[Contraction]) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line entry."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("weights", type=Path, nargs="*", default=[WEIGHTS], help="weights files (default: the estimator's)")
+    parser.add_argument(
+        "weights", type=Path, nargs="*", default=[WEIGHTS], help="weights files (default: the estimator's)"
+    )
     parser.add_argument("--doc", type=Path, help="rewrite the table between this document's markers")
     args = parser.parse_args(argv)
     try:

@@ -71,8 +71,8 @@ def figures_of(
     kinds : (S,)
         Group of each step.
     compared
-        It solves the recorded problems to the tolerance: its largest error counts every node of the oracle's windows, and the
-        newest node's difference from the reference in all steps. Otherwise None.
+        It solves the recorded problems to the tolerance: its largest error counts every node of the oracle's windows,
+        and the newest node's difference from the reference in all steps. Otherwise None.
     """
     rows = measured.rows[at]
     us, solve_us = rows[:, STEP_NS] / 1e3, rows[:, SOLVE_NS] / 1e3

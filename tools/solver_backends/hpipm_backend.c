@@ -2,7 +2,7 @@
  *
  * Variants: "ocp" (Riccati), "pcond5" (partial condensing 15 -> 5), "full" (condensing to the 32 unknowns); each with "-free"
  * behind it: the QP without its bounds first, and with them only if the result violates one, which is what a user who looks
- * for speed would do. Losses other than the quadratic weigh the residuals anew in each iteration. */
+ * for speed would do. */
 #include <math.h>
 #include <string.h>
 
@@ -12,10 +12,13 @@
 
 enum { LOSS_QUADRATIC = 0, LOSS_HUBER = 1, LOSS_GEMAN_MCCLURE = 2 }; /* est_settings.h, held together by a test */
 
+static const double SHRINK = 0.5; /* per iteration, or the next ones are careful; as in mhe.c */
+
 static window_t window;
 static qp_t bounded[2][WINDOW_NODES]; /* [hard, soft][stages]; made when opened */
 static qp_t unbounded[WINDOW_NODES];
 static bool free_first;
+static bool careful; /* this step keeps to the loss's majorant */
 static int sweeps_fixed;
 static double tolerance_given;
 static int loss_given = -1;
@@ -66,13 +69,22 @@ void backend_call(const double record[])
     model_step(before->u, before->theta, before->memory, newest->theta, newest->memory, jacobian);
 }
 
-static double loss_weight(double residual)
+/* What the loss makes of a residual: *pull times it is the gradient, the return value is the curvature; both are factors on the
+ * measurement's weight. The same rule as in mhe.c, for a fair comparison: the loss's own curvature where it is not negative, or,
+ * once that has not helped, the parabola that touches the loss from above. */
+static double loss_terms(double residual, double *pull)
 {
-    const double x = residual / window.setting[SETTING_LOSS_SCALE];
+    const double x = fabs(residual / window.setting[SETTING_LOSS_SCALE]);
+    *pull = 1.0;
     if ((int)window.setting[SETTING_LOSS] == LOSS_GEMAN_MCCLURE) {
-        return 1.0 / ((1.0 + x * x) * (1.0 + x * x));
+        *pull = 1.0 / ((1.0 + x * x) * (1.0 + x * x));
+        return careful ? *pull : *pull * fmax(0.0, (1.0 - 3.0 * x * x) / (1.0 + x * x));
     }
-    return (int)window.setting[SETTING_LOSS] == LOSS_HUBER ? 1.0 / fmax(1.0, fabs(x)) : 1.0;
+    if ((int)window.setting[SETTING_LOSS] == LOSS_HUBER) {
+        *pull = 1.0 / fmax(1.0, x);
+        return careful ? *pull : x > 1.0 ? 0.0 : 1.0;
+    }
+    return 1.0;
 }
 
 /* Put the linearisation at the present window into a QP. */
@@ -89,8 +101,9 @@ static void linearise(qp_t *qp, const double a[][QP_STATES * QP_STATES], const d
         double upper[2];
         for (int ch = 0; ch < 2; ch++) {
             const double residual = node->theta[ch] - node->y[ch];
-            weight[ch] = window_weight(&window, k, ch) * loss_weight(residual);
-            gradient[ch] = weight[ch] * residual;
+            double pull = 1.0;
+            weight[ch] = window_weight(&window, k, ch) * loss_terms(residual, &pull);
+            gradient[ch] = window_weight(&window, k, ch) * pull * residual;
             if (k == 0) {
                 weight[ch] += p0[ch];
                 gradient[ch] += p0[ch] * (node->theta[ch] - window.prior[ch]);
@@ -176,7 +189,9 @@ static double lone_node(void)
     for (int ch = 0; ch < 2; ch++) {
         window_node_t *node = &window.node[0];
         const double p0 = window_arrival(&window)[ch];
-        const double weight = window_weight(&window, 0, ch) * loss_weight(node->theta[ch] - node->y[ch]);
+        double pull = 1.0;
+        (void)loss_terms(node->theta[ch] - node->y[ch], &pull);
+        const double weight = window_weight(&window, 0, ch) * pull;
         double best = (p0 * window.prior[ch] + weight * node->y[ch]) / (p0 + weight);
         const double bound = fmin(fmax(best, s[SETTING_LOWER]), s[SETTING_UPPER]);
         if (s[SETTING_HARD] != 0.0) {
@@ -221,10 +236,13 @@ void backend_solve(backend_result_t *result)
         sweeps_fixed > 0 ? 0.0 : tolerance_given > 0.0 ? tolerance_given : window.setting[SETTING_TOLERANCE];
     *result = (backend_result_t){.status = 1, .kkt_degc = NAN};
     bool all_solved = true;
+    careful = false;
     while (result->sweeps < most && result->status == 1) {
         bool solved = false;
+        const double before = result->kkt_degc;
         result->kkt_degc = iterate(&solved);
         result->sweeps++;
+        careful = careful || (result->sweeps > 1 && !(result->kkt_degc < SHRINK * before));
         all_solved = all_solved && solved;
         if (result->kkt_degc <= tolerance) {
             result->status = all_solved ? 0 : 1;

@@ -27,7 +27,7 @@ class MeasureError(Exception):
 
 
 class Bench:
-    """Everything compiled into `folder`; each configuration gets a copy of its library, and with it a state of its own."""
+    """Everything compiled into `folder`; each configuration has a copy of its library, so a state of its own."""
 
     def __init__(self, weights: Path, folder: Path, configs: Sequence[Config]) -> None:
         self._folder, self.configs = folder, tuple(configs)
@@ -48,7 +48,10 @@ class Bench:
     def runs(self, place: int) -> bool:
         """Whether this machine has what the configuration needs (a kernel, say)."""
         stream = self._write([], "empty.bin")
-        return self._run([str(self._program), str(stream), str(self._folder / "empty.out"), self._words[place]]).returncode == 0
+        return (
+            self._run([str(self._program), str(stream), str(self._folder / "empty.out"), self._words[place]]).returncode
+            == 0
+        )
 
     def time(self, places: Sequence[int], segments: Sequence[Segment], repeats: int, every: int, core: int) -> Measured:
         """All chosen configurations in turns over all segments; every `every`-th step with window and problem."""
@@ -61,7 +64,7 @@ class Bench:
         return read_measured(np.fromfile(out), done.stdout.split())
 
     def count(self, place: int, segments: Sequence[Segment], functions: Sequence[str] = ("timed_*",)) -> int | None:
-        """Mean instructions of a step in these functions, by callgrind; None without valgrind, or where it cannot run the code."""
+        """Mean instructions of a step in these functions; None where callgrind is missing or cannot run the code."""
         if shutil.which("valgrind") is None:
             return None
         heads, steps = _counted_heads(segments), counted_steps(segments)
@@ -69,8 +72,9 @@ class Bench:
             return None
         stream = self._write(heads, "counted.bin")
         done = self._run([
-            "valgrind", "--tool=callgrind", *(f"--toggle-collect={name}" for name in functions), f"--callgrind-out-file={self._folder / 'callgrind.out'}",
-            str(self._program), str(stream), str(self._folder / "counted.out"), "-s", str(COUNTED_FROM), self._words[place],
+            "valgrind", "--tool=callgrind", *(f"--toggle-collect={name}" for name in functions),
+            f"--callgrind-out-file={self._folder / 'callgrind.out'}", str(self._program), str(stream),
+            str(self._folder / "counted.out"), "-s", str(COUNTED_FROM), self._words[place],
         ])  # fmt: skip
         found = re.search(r"Collected : (\d+)", done.stderr)
         return round(int(found.group(1)) / steps) if found and done.returncode == 0 else None

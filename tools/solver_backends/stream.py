@@ -1,4 +1,4 @@
-"""Recorded drives as a stream of MHE calls (stream.h): what the estimator asked of its MHE, for any solver to answer again."""
+"""Recorded drives as a stream of MHE calls (stream.h): what the estimator asked, for any solver to answer again."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ def situations() -> tuple[Situation, ...]:
         fault("combined", *both),
         fault("rotor noise", "noise:5@430-520/r"),
         Situation("paper, hard box", "bounds", 380.0, 530.0, 0, setting="paper"),
-        Situation("hard box met", "bounds", 420.0, 520.0, 0, changes={"hard_bounds": True, "upper_degc": 155.0}),
-        Situation("soft bound met", "bounds", 420.0, 520.0, 0, changes={"upper_degc": 150.0, "bound_weight": 300.0}),
+        Situation("hard box met", "bounds", 420.0, 520.0, 0, changes={"hard_bounds": True, "upper_degc": 150.0}),
+        Situation("soft bound met", "bounds", 420.0, 520.0, 0, changes={"upper_degc": 145.0, "bound_weight": 300.0}),
         Situation("quadratic loss", "quadratic", 380.0, 530.0, 0, changes={"loss": 0}),
         Situation("Huber loss", "nominal", 480.0, 530.0, 0, ("spike:2%@490-530",), changes={"loss": 1}),
     )  # fmt: skip

@@ -11,7 +11,18 @@ from tools.solver_backends.figures import Figures, best_hpipm, ratio
 
 BEGIN, END = "<!-- bench solver: begin -->", "<!-- bench solver: end -->"
 NONE = "–"
-HEAD = ("", "median µs", "p99", "max", "of which solve", "sweeps", "instructions", "of which MHE", "error °C", "state, bytes")
+HEAD = (
+    "",
+    "median µs",
+    "p99",
+    "max",
+    "of which solve",
+    "sweeps",
+    "instructions",
+    "of which MHE",
+    "error °C",
+    "state, bytes",
+)
 
 
 class DocumentError(Exception):
@@ -51,11 +62,13 @@ def kind_rows(found: dict[str, Figures]) -> tuple[list[str], list[list[str]]]:
         return [], []
     kinds = found[names[0].name]["kinds"]
     return ["steps", "number", *(c.name for c in names)], [
-        [kind, f"{found[names[0].name]['kinds'][kind]['steps']:,}", *(
-            f"{found[c.name]['kinds'][kind]['median_us']:.1f} ({found[c.name]['kinds'][kind]['sweeps_mean']:.1f})" for c in names
-        )]
-        for kind in kinds
-    ]  # fmt: skip
+        [kind, f"{of_first['steps']:,}", *(_median_and_sweeps(found[c.name]["kinds"][kind]) for c in names)]
+        for kind, of_first in kinds.items()
+    ]
+
+
+def _median_and_sweeps(figures: Figures) -> str:
+    return f"{figures['median_us']:.1f} ({figures['sweeps_mean']:.1f})"
 
 
 def verdicts(found: dict[str, Figures]) -> list[str]:

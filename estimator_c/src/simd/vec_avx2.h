@@ -91,15 +91,18 @@ VEC_INLINE double vec_sum(vec_t x)
     return _mm_cvtsd_f64(_mm_add_sd(two, _mm_unpackhi_pd(two, two)));
 }
 
-/* 1/(1 + 2^a) for |a| < 1e15, absolute error <= 3e-16; 0 and 1 within 2^-64 where the power is held there; NaN gives NaN,
- * an infinite a its end or NaN. The polynomial is that of net_gates(). The power of two is made beside the polynomial, which takes longer. */
+/* 1/(1 + 2^a) for |a| < 1e15, absolute error <= 3e-16; the ends are held within 2^-63 of 0 and 1; NaN gives NaN, an
+ * infinite a its end or NaN. The polynomial is that of net_gates(). The power of two is made beside the polynomial, which
+ * takes longer. */
 VEC_INLINE vec_t vec_gate(vec_t a)
 {
     const vec_t one = vec_all(1.0);
     const vec_t shift = vec_all(6755399441055744.0); /* 1.5 2^52: adding it rounds to a whole number */
     const vec_t shifted = vec_add(a, shift);
     const vec_t r = vec_sub(a, vec_sub(shifted, shift));
-    const vec_t held = _mm256_min_pd(vec_all(6755399441055744.0 + 63.0), _mm256_max_pd(vec_all(6755399441055744.0 - 64.0), shifted));
+    const vec_t most = vec_all(6755399441055744.0 + 63.0);
+    const vec_t least = vec_all(6755399441055744.0 - 64.0);
+    const vec_t held = _mm256_min_pd(most, _mm256_max_pd(least, shifted)); /* the second operand where it is NaN */
     const __m256i bits = _mm256_slli_epi64(_mm256_add_epi64(_mm256_castpd_si256(held), _mm256_set1_epi64x(1023)), 52);
     const vec_t scale = _mm256_castsi256_pd(bits);
     const vec_t r2 = vec_mul(r, r);
