@@ -338,7 +338,7 @@ static real_t tridiagonal_step(mhe_t *self, real_pair_t step[], int *active, boo
     return real_finite(sum) ? largest : (real_t)NAN;
 }
 
-/* One sweep from up-to-date stages: where the next solve would go, and there unless the tolerance is met. */
+/* One sweep from up-to-date stages: the step that the solve asks for, and there. */
 static void sweep(mhe_t *self, mhe_result_t *result)
 {
     real_pair_t step[MHE_NODES];
@@ -354,15 +354,12 @@ static void sweep(mhe_t *self, mhe_result_t *result)
     result->sweeps++;
     self->careful = self->careful || (result->sweeps > 1 && !(result->kkt_degc < SHRINK * before));
     self->converged = result->kkt_degc <= self->tolerance && settled;
-    if (self->converged) {
-        return;
-    }
     for (int k = 0; k < self->count; k++) {
         for (int ch = 0; ch < MHE_CHANNELS; ch++) {
             at(self, k)->theta[ch] += step[k][ch];
         }
     }
-    self->stale = true;
+    self->stale = !self->converged; /* the last step, within the tolerance, makes the estimate better but moves no stage */
 }
 
 /* Close the books of a solve: the estimate, and whether all of it is finite. */

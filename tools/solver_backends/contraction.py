@@ -2,7 +2,7 @@
 
     python -m tools.solver_backends.contraction [--doc docs/solver.md] WEIGHTS.json ...
 
-Each net drives its own recorded drive (with process and sensor noise, driven hard), and the C's MHE follows it. In every
+Each net drives its own recorded drive (with process and sensor noise, driven hard), and the C's MHE follows it. In each
 step the solver is asked for one sweep at a time; the change in °C that a sweep asks for, over the one before, is the
 contraction. Changes below 1e-9 °C are rounding and left out.
 """
