@@ -7,6 +7,7 @@ static const int32_t VALUES = 100;            /* 10 s */
 static const int32_t FRESH = 25;              /* values since the last coolant temperature: it comes once a second */
 static const double BELIEVABLE_DEGC = 5.0;    /* further from the datasheet the sensor is broken, not offset */
 static const double SPREAD_MAX_DEGC = 1.0;    /* standard deviation: noisier, nothing can be said */
+static const double SIGMA_MAX_DEGC = 50.0;
 static const double ISOTHERMAL_DEGC = 0.05;   /* what soaked may still mean: part of the uncertainty */
 
 void offset_calibration_init(offset_calibration_t *self, double datasheet_degc, double sigma_degc, int32_t delay_steps,
@@ -57,7 +58,7 @@ static bool take(offset_calibration_t *self, int ch)
     const double variance = self->m2[ch] / (VALUES - 1);
     const double from_datasheet = self->mean[ch] - self->datasheet_degc;
     if (fabs(from_datasheet) > BELIEVABLE_DEGC || variance > SPREAD_MAX_DEGC * SPREAD_MAX_DEGC) {
-        self->result.sigma_degc[ch] = fmax(self->result.sigma_degc[ch], fabs(from_datasheet));
+        self->result.sigma_degc[ch] = fmin(SIGMA_MAX_DEGC, fmax(self->result.sigma_degc[ch], fabs(from_datasheet)));
         return false;
     }
     self->result.offset_degc[ch] = self->mean[ch];

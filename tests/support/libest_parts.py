@@ -72,7 +72,7 @@ class Verdict(ct.Structure):
     """monitor_verdict_t."""
 
     _fields_ = (("share", f64), ("offset", f64), ("forget", ct.c_int32), ("resume", ct.c_bool), ("level", f64),
-                ("creep", ct.c_bool))  # fmt: skip
+                ("settled", ct.c_bool), ("creep", ct.c_bool))  # fmt: skip
 
 
 class _MonitorHead(ct.Structure):

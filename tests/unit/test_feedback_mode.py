@@ -1,4 +1,4 @@
-"""Publish after one sweep, solve on afterwards: the published estimate is close, the next step begins from the solution."""
+"""Publish after one sweep, solve on afterwards: what is published is close, the next step begins from the solution."""
 
 from __future__ import annotations
 
