@@ -54,7 +54,7 @@ FIELDS = (
     Field("robust", "supervise", "supervise", "bool", 0, 1, "watch the sensors and distrust a faulty one"),
     Field("robust", "gate_sigma", "gate_sigma", "float", 1, 100, "standard deviations beyond which a value is out"),
     Field("robust", "drift_degc", "drift_degc", PER_CHANNEL, 0.01, 1000, "slow innovation that means drift"),
-    Field("robust", "open_loop_s", "open_loop_s", "float", 1, 3600, "distrust after which the upper bound grows"),
+    Field("robust", "open_loop_s", "open_loop_s", "float", 1, 3600, "distrust after which the status is open_loop"),
     Field("weights", "measurement", "weight_measurement", PER_CHANNEL, 0, 1e6, "Wy, 1/K^2"),
     Field("weights", "noise", "weight_noise", PER_CHANNEL, 1e-6, 1e9, "Ww, 1/K^2 per interval"),
     Field("weights", "arrival", "weight_arrival", PER_CHANNEL, 1e-9, 1e9, "P0 once the window is full, 1/K^2"),

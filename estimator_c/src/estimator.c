@@ -17,7 +17,7 @@ static const double UPPER_SIGMA = 3.0;
 static const double MODEL_VARIANCE = 0.01; /* K^2: a plant that is not quite the one the net knows, see docs/estimator.md */
 static const double START_VARIANCE = 0.09; /* the same while the net's memory is still filling */
 static const int32_t START_STEPS = 200;
-static const double MARGIN_DEGC_S = 0.05; /* of the upper bound, after too long without a trusted sensor */
+static const double MARGIN_DEGC_S = 0.05; /* of the upper bound, without a trusted sensor */
 static const double MARGIN_MAX_DEGC = 10.0;
 
 /* Larger magnitudes are no temperature in degC, torque in Nm or speed in rpm but a broken sender; they would wear off
@@ -506,15 +506,14 @@ static double distrusted_s(const sensor_monitor_t *monitor)
     return monitor->trusted ? 0.0 : NET_DT_S * monitor->distrusted_steps;
 }
 
-/* What is said of a channel beside its estimate. The bound grows once the sensor has been distrusted for long. */
+/* What is said of a channel beside its estimate. The bound grows from the moment its sensor is distrusted. */
 static estimator_channel_t channel_now(const estimator_t *self, int ch, double theta_degc)
 {
     const sensor_monitor_t *monitor = &self->fusion.monitor[ch];
     const double sigma = sqrt(self->variance[ch]);
     const double offset_sigma = self->calibration.result.sigma_degc[ch];
     const double model = self->fusion.steps < START_STEPS ? START_VARIANCE : MODEL_VARIANCE;
-    const double beyond_s = fmax(0.0, distrusted_s(monitor) - self->setting.open_loop_s);
-    const double margin = fmin(MARGIN_MAX_DEGC, MARGIN_DEGC_S * beyond_s);
+    const double margin = fmin(MARGIN_MAX_DEGC, MARGIN_DEGC_S * distrusted_s(monitor));
     return (estimator_channel_t){
         .fault = monitor->fault,
         .trusted = monitor->trusted && self->fusion.share[ch] > 0.0,

@@ -6,7 +6,7 @@
  * newest measurement speaks, and the net runs forward from there to now with the stored inputs. Between two intervals
  * the estimate follows the rate that the net gives for the motor frames received so far.
  *
- * Everything: no allocation, no printing; one thread at a time per object; state sizeof(estimator_t) (18 kB with 8 cells),
+ * Everything: no allocation, no printing; one thread at a time per object; state sizeof(estimator_t) (27 kB with 8 cells),
  * owned by the caller. */
 #ifndef ESTIMATOR_H
 #define ESTIMATOR_H
@@ -26,19 +26,19 @@ typedef enum {
     ESTIMATOR_INIT = 0,        /* nothing to work on yet */
     ESTIMATOR_STARTING = 1,    /* frames arrive, but no measurement speaks for a known interval yet */
     ESTIMATOR_RUNNING = 2,
-    ESTIMATOR_PREDICTING = 3,  /* no measurement for longer than the setting's timeout: the net alone. A channel that
-                                * never had one started at the other's temperature */
+    ESTIMATOR_PREDICTING = 3,  /* a channel has no measurement for longer than the setting's timeout, or a sensor that is not
+                                * believed: the net alone. A channel that never had one started at the other's temperature */
     ESTIMATOR_INPUT_STALE = 4, /* the newest interval had no motor frame: its input was held */
     ESTIMATOR_INVALID = 5,     /* a result was not finite; the estimator has started again */
-    ESTIMATOR_OPEN_LOOP = 6,   /* a channel without a trusted sensor for longer than the setting's limit: the upper bound grows */
-    ESTIMATOR_FALLBACK = 7,    /* the MHE gave no usable solution: the estimate is the Kalman filter's */
+    ESTIMATOR_OPEN_LOOP = 6,   /* a channel without a trusted sensor for longer than the setting's limit */
+    ESTIMATOR_FALLBACK = 7,    /* the MHE gave no usable solution: the estimate is the Kalman filter's. Goes before 3 and 6 */
 } estimator_status_t;
 
 /* One temperature, beside its estimate. */
 typedef struct {
     sensor_class_t fault;    /* of its sensor */
     bool trusted;            /* the newest measurement counts in the estimate */
-    double sigma_degc;       /* standard deviation of the published estimate; NAN before the first */
+    double sigma_degc;       /* standard deviation of the estimate, the filter's at the newest measurement; NAN before the first */
     double upper_degc;       /* conservative upper bound of the temperature; NAN before the first */
     double innov_sigma_degc; /* predicted standard deviation of the innovation; NAN if none came since */
 } estimator_channel_t;

@@ -6,7 +6,7 @@
  * The MHE's estimate is published; the EKF gives the variance, and the estimate where the MHE has none or the setting says
  * so. All see the same shares of the same values.
  *
- * No allocation, no clock, no printing; one thread at a time per object; the caller owns it (17 kB with 8 cells). */
+ * No allocation, no clock, no printing; one thread at a time per object; the caller owns it (18 kB with 8 cells). */
 #ifndef FUSION_H
 #define FUSION_H
 
@@ -68,7 +68,8 @@ void fusion_doubt(fusion_t *self, double novelty);
  * channel. Returns the innovation (NAN: none) and its predicted variance. */
 double fusion_measure(fusion_t *self, int channel, double y, double raw, double *variance);
 
-/* A value for a node `age` steps back, which came after that node's step. Returns the innovation; NAN: too late. */
+/* A value for a node `age` > 0 steps back, later than the next value. It enters the MHE's window if the monitor would have let it,
+ * not the filter. Returns the innovation; NAN: too late, or no MHE. */
 double fusion_measure_late(fusion_t *self, int age, int channel, double y, double raw);
 
 /* Solve and give the estimate at the newest node; in mode feedback, after one sweep. */

@@ -31,7 +31,7 @@ static const int32_t USUAL_BLOCK = 100;      /* 10 s; what is usual is MONITOR_P
 static const double USUAL_KEEP = 0.998;      /* per block: 80 min */
 static const int32_t WARM_UP = 600;          /* steps before drift is judged */
 static const int32_t CALM_SHORT = 20, CALM_STEP = 30, CALM_CREEP = 100; /* steps before trust returns */
-static const double PLAUSIBLE_DEGC = 0.3;    /* and how far the level may be off, beside 3 sigma of the prediction */
+static const double PLAUSIBLE_DEGC = 0.3;     /* how far the level may be off, beside 3 sigma of the prediction */
 static const double CREEP_DEGC = 0.6;        /* the same after a creeping fault ... */
 static const double CREEP_DEGC_S = 0.015;    /* ... and how that widens: what still creeps must stay outside */
 

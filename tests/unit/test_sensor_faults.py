@@ -203,7 +203,7 @@ def test_what_is_not_believed_is_called_so(channel: int, name: str) -> None:
 
 @pytest.mark.parametrize("channel", [W, R])
 def test_the_upper_bound_moves_away_in_open_loop(channel: int) -> None:
-    """After 30 s without the sensor by 0.05 K/s, by 10 K at most; on the lap the truth stays below it."""
+    """Without the sensor by 0.05 K/s, by 10 K at most; on the lap the truth stays below it."""
     lap = faulted_lap(on(channel, catalogue()["F3 severe"]), 1)
     width = lap.upper[:, channel] - lap.theta[:, channel]
     margin = width - 3.0 * lap.sigma[:, channel]
