@@ -153,6 +153,10 @@ static bool call(int op, int length)
         mhe_shift(&mhe, channel, p[1]);
         count(PART_LEVEL, begun);
         return length == 2;
+    case STREAM_WEIGH:
+        mhe_weigh(&mhe, p, p[2]);
+        count(PART_LEVEL, begun);
+        return length == 3;
     case STREAM_INIT:
         begin();
         return length == STREAM_SETTING;

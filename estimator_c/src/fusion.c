@@ -46,7 +46,6 @@ static void set_noise(fusion_t *self)
         const double m = fmax(0.0, fabs(self->slow.bias[ch]) - LACK_USUAL);
         const double q = 1.0 / self->setting.weight_noise[ch] + 2.0 * LACK_S * NET_DT_S * m * m;
         self->ekf.q[ch] = q;
-        self->mhe.weight_noise[ch] = 1.0 / q;
     }
 }
 
@@ -90,15 +89,21 @@ void fusion_advance(fusion_t *self, const double u[2])
     slow_observer_predict(&self->slow, u);
 }
 
-/* The loss bends where values are out of the ordinary, and with a noisy sensor the ordinary is wider. */
-static void set_loss_scale(fusion_t *self)
+/* Hand the noise to the MHE, and the loss's scale: it bends where values are out of the ordinary, and with a noisy sensor the
+ * ordinary is wider. */
+static void weigh(fusion_t *self)
 {
+    double noise[MHE_CHANNELS];
     double wider = 1.0;
-    for (int ch = 0; ch < MHE_CHANNELS && self->setting.supervise; ch++) {
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         const sensor_monitor_t *monitor = &self->monitor[ch];
+        noise[ch] = 1.0 / self->ekf.q[ch];
         wider = fmax(wider, monitor->spread_r / monitor->r);
     }
-    self->mhe.loss_scale = self->setting.loss_scale_degc * sqrt(wider);
+    const double scale = self->setting.loss_scale_degc * sqrt(wider);
+    if (noise[0] != self->mhe.weight_noise[0] || noise[1] != self->mhe.weight_noise[1] || scale != self->mhe.loss_scale) {
+        mhe_weigh(&self->mhe, noise, scale);
+    }
 }
 
 void fusion_doubt(fusion_t *self, double novelty)
@@ -218,7 +223,9 @@ void fusion_solve(fusion_t *self, fusion_estimate_t *estimate)
     *estimate = (fusion_estimate_t){.status = MHE_OK};
     bool solved = false;
     if (uses_mhe(self)) {
-        set_loss_scale(self);
+        if (self->setting.supervise) {
+            weigh(self);
+        }
         estimate->status = feedback ? mhe_feedback(&self->mhe, result) : mhe_solve(&self->mhe, result);
         solved = estimate->status == MHE_OK ||
                  (estimate->status == MHE_MAX_SWEEPS && result->kkt_degc < (feedback ? FEEDBACK_KKT_DEGC : USABLE_KKT_DEGC));

@@ -141,6 +141,12 @@ real_t mhe_measure(mhe_t *self, int age, int channel, real_t y, real_t share)
     return y - node->theta[channel];
 }
 
+void mhe_weigh(mhe_t *self, const real_t noise[MHE_CHANNELS], real_t loss_scale)
+{
+    memcpy(self->weight_noise, noise, sizeof self->weight_noise);
+    self->loss_scale = loss_scale;
+}
+
 void mhe_forget(mhe_t *self, int channel, int nodes)
 {
     for (int k = self->count - 1; k >= 0 && k >= self->count - nodes; k--) {

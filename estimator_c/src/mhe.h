@@ -98,6 +98,9 @@ void mhe_arrival(mhe_t *self, const real_t prior[MHE_CHANNELS], const real_t wei
  * outside the window or a value that is not finite. */
 real_t mhe_measure(mhe_t *self, int age, int channel, real_t y, real_t share);
 
+/* Other weights of the noise (Ww, 1/K^2) and another scale of the loss (degC) than the setting's, from the next solution on. */
+void mhe_weigh(mhe_t *self, const real_t noise[MHE_CHANNELS], real_t loss_scale);
+
 /* Take back the measurements of the newest `nodes` nodes: they turned out to be worth nothing. */
 void mhe_forget(mhe_t *self, int channel, int nodes);
 

@@ -151,7 +151,8 @@ static int play(estimator_t *self, uint32_t round, uint32_t frames)
     for (uint32_t k = 0; k < frames; k++) {
         tick = wild || below(300) == 0 ? next_tick(tick) : tick + 1;
         if (below(50) != 0) {
-            const double torque = wild ? value(-160, 160) : 0.0, speed = wild ? value(0, 11500) : 1000.0;
+            const bool stands = soak && k < 3000; /* or no offset is measured */
+            const double torque = wild ? value(-160, 160) : 0.0, speed = wild ? value(0, 11500) : stands ? 0.0 : 1000.0;
             estimator_feed_motor(self, (uint16_t)tick, torque, speed, below(40) != 0);
         }
         if (tick % 10 == 0 || below(200) == 0) {

@@ -102,6 +102,9 @@ void backend_call(const double record[])
     case STREAM_SHIFT:
         mhe_shift(&mhe, (int)at[0], (value_t)at[1]);
         break;
+    case STREAM_WEIGH:
+        mhe_weigh(&mhe, (const value_t[2]){(value_t)at[0], (value_t)at[1]}, (value_t)at[2]);
+        break;
     default:
         break;
     }

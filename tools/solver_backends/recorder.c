@@ -20,6 +20,7 @@ void __real_mhe_arrival(mhe_t *self, const value_t prior[], const value_t weight
 value_t __real_mhe_measure(mhe_t *self, int age, int channel, value_t y, value_t share);
 void __real_mhe_forget(mhe_t *self, int channel, int nodes);
 void __real_mhe_shift(mhe_t *self, int channel, value_t shift);
+void __real_mhe_weigh(mhe_t *self, const value_t noise[], value_t loss_scale);
 mhe_status_t __real_mhe_solve(mhe_t *self, mhe_result_t *result);
 
 /* Begin a record; returns where its payload goes. */
@@ -127,6 +128,14 @@ void __wrap_mhe_shift(mhe_t *self, int channel, value_t shift)
     at[0] = channel;
     at[1] = (double)shift;
     __real_mhe_shift(self, channel, shift);
+}
+
+void __wrap_mhe_weigh(mhe_t *self, const value_t noise[], value_t loss_scale)
+{
+    double *at = record(STREAM_WEIGH, 3);
+    copy(at, noise, 2);
+    at[2] = (double)loss_scale;
+    __real_mhe_weigh(self, noise, loss_scale);
 }
 
 mhe_status_t __wrap_mhe_solve(mhe_t *self, mhe_result_t *result)

@@ -13,7 +13,8 @@ enum {
     STREAM_MEASURE = 5, /* age channel y share */
     STREAM_FORGET = 6,  /* channel nodes */
     STREAM_SHIFT = 7,   /* channel shift */
-    STREAM_SOLVE = 8,   /* nothing: end of a step */
+    STREAM_WEIGH = 8,   /* noise weight[2] loss scale */
+    STREAM_SOLVE = 9,   /* nothing: end of a step */
 };
 
 /* Places in the payload of STREAM_INIT: the fields of est_setting_t that the MHE reads, and the sensor's delay. */

@@ -16,8 +16,8 @@ from tests.support.libest import Estimator, Lib, compile_library
 from tools.compare_drives import Lap, drive_lap, sense
 
 Array = NDArray[np.float64]
-INIT, START, ADVANCE, ARRIVAL, MEASURE, FORGET, SHIFT, SOLVE = range(1, 9)  # stream.h
-WRAPPED = ("init", "start", "advance", "arrival", "measure", "forget", "shift", "solve")
+INIT, START, ADVANCE, ARRIVAL, MEASURE, FORGET, SHIFT, WEIGH, SOLVE = range(1, 10)  # stream.h
+WRAPPED = ("init", "start", "advance", "arrival", "measure", "forget", "shift", "weigh", "solve")
 ROWS_PER_S = 10
 HERE = Path(__file__).resolve().parent
 

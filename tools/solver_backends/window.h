@@ -101,6 +101,10 @@ static inline void window_call(window_t *self, const double record[])
         }
         self->prior[(int)at[0]] += at[1];
         break;
+    case STREAM_WEIGH:
+        memcpy(&self->setting[SETTING_NOISE], at, 2 * sizeof *at);
+        self->setting[SETTING_LOSS_SCALE] = at[2];
+        break;
     default:
         break;
     }
