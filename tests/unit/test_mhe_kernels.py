@@ -100,7 +100,7 @@ def test_unknown_kernel_changes_nothing() -> None:
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_feedback_and_finish_are_a_solve(loss: str) -> None:
-    """Bit for bit; and the feedback alone is near already: within 0.02 degC, 0.1 where a measurement jumps by 6."""
+    """Bit for bit; and the feedback alone is near already: within 0.01 degC, 0.1 where a measurement jumps by 6."""
     lib = library("portable")
     whole, parts = recorder(lib, loss, tolerance_degc=1e-6), recorder(lib, loss, tolerance_degc=1e-6)
     unfinished = 0
@@ -117,7 +117,8 @@ def test_feedback_and_finish_are_a_solve(loss: str) -> None:
         assert bytes(partial) == bytes(result)
         unfinished += first
         if step >= NODES:
-            bound = 0.1 if 29 < step < 41 or step % 9 == 5 else 0.02
+            usual = 0.03 if loss == "huber" else 0.01  # on which side of its kink a value lies, the next sweep finds out
+            bound = 0.1 if 29 < step < 41 or step % 9 == 5 else usual
             np.testing.assert_allclose(early, whole.mhe.theta()[-1], rtol=0, atol=bound)
     assert unfinished > 40
 
