@@ -117,7 +117,7 @@ def test_feedback_and_finish_are_a_solve(loss: str) -> None:
         assert bytes(partial) == bytes(result)
         unfinished += first
         if step >= NODES:
-            usual = 0.03 if loss == "huber" else 0.01  # on which side of its kink a value lies, the next sweep finds out
+            usual = 0.03 if loss == "huber" else 0.01  # the side of its kink is found by sweeps
             bound = 0.1 if 29 < step < 41 or step % 9 == 5 else usual
             np.testing.assert_allclose(early, whole.mhe.theta()[-1], rtol=0, atol=bound)
     assert unfinished > 40
