@@ -1,0 +1,1 @@
+"""Timing read from what was on the bus: pure functions over stamps and decoded frames."""
