@@ -31,6 +31,7 @@ UNIT_OF_SUFFIX = {
 CLASSIC_BYTES = 8
 STANDARD_IDS = 0x800
 NO_NODE = "Vector__XXX"
+LOGGER = "LOGGER"
 
 
 class Finding(NamedTuple):
@@ -296,8 +297,11 @@ def data_ids(db: Database) -> Iterator[tuple[str, str]]:
 @_rule
 def truth(db: Database) -> Iterator[tuple[str, str]]:
     for m in db.messages:
-        if bool(_attribute(m, "HilSimulationOnly")) != m.name.startswith("Truth"):
-            yield m.name, "HilSimulationOnly and a name that starts with Truth go together"
+        simulation_only = bool(_attribute(m, "HilSimulationOnly"))
+        if m.name.startswith("Truth") and not simulation_only:
+            yield m.name, "its name starts with Truth: set HilSimulationOnly"
+        if simulation_only and {r for s in m.signals for r in s.receivers} - {LOGGER}:
+            yield m.name, f"HilSimulationOnly: nobody but {LOGGER} may receive it"
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -18,8 +18,8 @@ RELEASES_LAST, SKIPPED_LAST = (1 << 24) - 2, (1 << 16) - 2  # counters stop at t
 SETTLE_S = 10.0  # accuracy is judged from here after the first estimate: the net's memory starts empty
 REPEATED, WRONG_CRC = 1, 4  # E2E states as in the log
 STATUS_SHOWN = ("init", "starting", "ok", "predicting", "input_stale", "invalid", "open_loop", "fallback")
-CAUSES = ("none", "late_wake", "preempted", "long_compute", "stale_input", "blocked_send")
-MACHINE_CAUSES = ("late_wake", "preempted")
+CAUSES = ("none", "late_wake", "preempted", "long_compute", "stale_input", "blocked_send", "steal")
+MACHINE_CAUSES = ("late_wake", "preempted", "steal")
 CORE_FAULTS = {
     "EstCoreFaults": ("restarts", "held_intervals", "late_measurements", "stray_ticks"),
     "EstCoreFaults2": ("off_grid", "invalid_inputs", "unconverged", "repeated_ticks"),

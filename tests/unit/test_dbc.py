@@ -8,6 +8,7 @@ import cantools
 import pytest
 
 from rt_runner.dbc import DEFAULT_DBC, DbcError, load_dbc, parse_dbc
+from rt_runner.result import CAUSES
 
 SETTINGS = Path(__file__).resolve().parents[2] / "estimator_c" / "settings"
 
@@ -49,6 +50,12 @@ CONTRACT = {
     "EstTimingB": (0x2A9, "ESTIMATOR", 100, {
         "miss_cause": (12, 4, False, 1, 0, True), "exec_wall_us": (16, 24, False, 0.1, 0, True),
         "resp_us": (40, 24, False, 0.1, 0, True)}),
+    "EstTimingC": (0x2AA, "ESTIMATOR", 100, {
+        "output": (12, 2, False, 1, 0, False), "cut": (14, 1, False, 1, 0, False),
+        "queued": (15, 1, False, 1, 0, False), "in_age_motor_us": (16, 24, False, 0.1, 0, True),
+        "in_age_temp_us": (40, 24, False, 0.1, 0, True)}),
+    "EstTimingD": (0x2AB, "ESTIMATOR", 100, {
+        "exec_cpu_us": (16, 24, False, 0.1, 0, True), "canary_us": (40, 24, False, 0.1, 0, True)}),
     "EstReleases": (0x4A0, "ESTIMATOR", 1000, {
         "releases": (16, 24, False, 1, 0, False), "jobs": (40, 24, False, 1, 0, False)}),
     "EstMisses": (0x4A1, "ESTIMATOR", 1000, {
@@ -69,6 +76,20 @@ CONTRACT = {
         "calibration_state": (12, 4, False, 1, 0, False), "offset_w_degc": (16, *S16, 1 / 256, 0, True),
         "offset_r_degc": (32, *S16, 1 / 256, 0, True), "offset_sigma_w_degc": (48, 8, False, 0.005, 0, True),
         "offset_sigma_r_degc": (56, 8, False, 0.005, 0, True)}),
+    **{name: (can_id, "ESTIMATOR", 1000, {n: (s, *U16, 1, 0, False) for n, s in zip(names, (16, 32, 48), strict=True)})
+       for name, can_id, names in (("EstOverload", 0x4A7, ("queued", "cut", "rebased")),
+                                   ("EstOutputs", 0x4A9, ("held", "predicted", "invalidated")),
+                                   ("EstEnvironment", 0x4AA, ("minor_faults", "major_faults", "invol_switches")))},
+    "EstMissRun": (0x4A8, "ESTIMATOR", 1000, {
+        "consec_miss_max": (16, *U16, 1, 0, False), "mk_worst": (32, 8, False, 1, 0, False),
+        "phase_us": (40, 24, False, 1, 0, True)}),
+    "EstMachine": (0x4AB, "ESTIMATOR", 1000, {
+        "run_delay_ms": (16, *U16, 0.1, 0, True), "steal_ms": (32, *U16, 10, 0, True),
+        "migrations": (48, *U16, 1, 0, False)}),
+    **{name: (can_id, "ESTIMATOR", 1000, {
+        f"{of}p99_us": (16, 24, False, 0.1, 0, True), f"{of}max_us": (40, 24, False, 0.1, 0, True)})
+       for name, can_id, of in (("EstCanary", 0x4AC, "canary_"), ("EstWakeStat", 0x4AD, ""),
+                                ("EstExecStat", 0x4AE, ""), ("EstRespStat", 0x4AF, ""))},
     "TruthTemp": (0x6A0, "PLANT", 100, {
         "theta_w_true_degc": (12, 18, False, 1 / 512, -100, True),
         "theta_r_true_degc": (30, 18, False, 1 / 512, -100, True), "tick": (48, *U16, 1, 0, False)}),
@@ -77,6 +98,9 @@ CONTRACT = {
         "tick": (48, *U16, 1, 0, False)}),
     "TruthFault": (0x6A2, "PLANT", 100, {
         "fault_w": (16, *U16, 1, 0, False), "fault_r": (32, *U16, 1, 0, False), "tick": (48, *U16, 1, 0, False)}),
+    "PlantSample": (0x6A3, "PLANT", 10, {
+        "sample_us": (12, 24, False, 1, 0, True), "send_us": (36, 12, False, 1, 0, True),
+        "tick": (48, *U16, 1, 0, False)}),
     "PlantStatus": (0x6B0, "PLANT", 1000, {
         "ticks_late": (16, *U16, 1, 0, False), "late_max_ms": (32, *U16, 0.1, 0, True),
         "tx_retries": (48, *U16, 1, 0, False)}),
@@ -103,9 +127,9 @@ def test_the_file_is_the_agreed_contract():
     }  # fmt: skip
     assert found == CONTRACT
     assert all(m.length == 8 and not m.codec.is_extended_frame for m in dbc)
-    assert {m.name for m in dbc if m.simulation_only} == {"TruthTemp", "TruthVehicle", "TruthFault"}
-    per_job = {"Estimate", "EstimateInnov", "EstValidity", "EstWinding", "EstRotor", "EstTimingA", "EstTimingB"}
-    assert {m.name for m in dbc if m.per_job} == per_job
+    assert {m.name for m in dbc if m.simulation_only} == {"TruthTemp", "TruthVehicle", "TruthFault", "PlantSample"}
+    content = {"Estimate", "EstimateInnov", "EstValidity", "EstWinding", "EstRotor"}
+    assert {m.name for m in dbc if m.per_job} == content | {f"EstTiming{x}" for x in "ABCD"}
     assert dbc["EstBuild"].signals[-1].raw_max == 254, "any setting has a number"
 
 
@@ -123,6 +147,9 @@ def test_cantools_loads_it_strictly_and_shows_labels():
     assert labels("EstWinding", "sensor_w_fault") == labels("EstRotor", "sensor_r_fault") == classes
     states = dict(enumerate(("datasheet", "measuring", "frozen", "refused")))
     assert labels("EstCalibration", "calibration_state") == states
+    causes = {**dict(enumerate(CAUSES)), 15: "not_available"}
+    assert labels("EstTimingB", "miss_cause") == causes
+    assert labels("EstTimingC", "output") == dict(enumerate(("computed", "held", "predicted", "invalid")))
 
 
 def test_every_setting_of_the_estimator_has_its_label():

@@ -47,6 +47,7 @@ BROKEN = [
     ("data_ids", TEMP_IDS, MOTOR_IDS.replace("BO_ 160", "BO_ 416"), True),
     ("data_ids", TEMP_IDS, TEMP_IDS[:-35] + '"E914606A6653F6BAB27063C2287C317D";', True),  # counter 0 passes as 9
     ("truth", 'BA_ "HilSimulationOnly" BO_ 1696 1;', "", True),
+    ("truth", '[0|4094] "us" LOGGER', '[0|4094] "us" ESTIMATOR,LOGGER', True),
 ]  # fmt: skip
 
 
