@@ -1,4 +1,4 @@
-"""PI driver: turns a speed error into driving, regenerating and friction torque."""
+"""PI driver: turns a speed error into driving, regenerating and friction torque; or a controller's command instead."""
 
 from __future__ import annotations
 
@@ -16,6 +16,41 @@ class DriverCommand(NamedTuple):
     regen_nm: float
     friction_nm: float
     integral_nm: float
+
+
+class TorqueCommand(NamedTuple):
+    """What a controller asks of machine and brakes, at the machine shaft: accelerate >= 0, brake and friction <= 0."""
+
+    accelerate_nm: float
+    brake_nm: float
+    friction_nm: float
+
+
+def obey(
+    command: TorqueCommand,
+    v_mps: float,
+    v_ref_mps: float,
+    drive_limit_nm: float,
+    regen_limit_nm: float,
+    p: DriverParams,
+) -> DriverCommand:
+    """Clip a command to the envelope at this speed; a part of the wrong sign is no torque.
+
+    Returns
+    -------
+    DriverCommand
+        Its integrator is the one that makes the PI driver ask for the same torque: it takes over without a jump.
+    """
+    drive = min(max(command.accelerate_nm, 0.0), drive_limit_nm)
+    regen = max(min(command.brake_nm, 0.0), -regen_limit_nm)
+    friction = max(min(command.friction_nm, 0.0), p.u_min_nm)
+    integral = drive + regen + friction - p.kp_nm_per_mps * (v_ref_mps - v_mps)
+    return DriverCommand(drive, regen, friction, min(max(integral, -p.integral_max_nm), p.integral_max_nm))
+
+
+def linear_share(theta_degc: float, start_degc: float, end_degc: float) -> float:
+    """Linear derating: 1 up to the start, 0 from the end on."""
+    return min(max((end_degc - theta_degc) / (end_degc - start_degc), 0.0), 1.0)
 
 
 def driver_step(

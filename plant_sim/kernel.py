@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from plant_sim.cycles import Cycle
 from plant_sim.dq_map import SPEED_STEP_RPM, THETA_GRID, TORQUE_STEP_NM, build_dq_map
-from plant_sim.driver import STANDSTILL_MPS
+from plant_sim.driver import STANDSTILL_MPS, TorqueCommand
 from plant_sim.losses import LossModel
 from plant_sim.lptn import DT_S, GRID_RPM, build_lptn
 from plant_sim.network import build_network
@@ -26,6 +26,7 @@ from plant_sim.state import GRADE, INTEGRAL, N_ROW, TORQUE, V, X
 from plant_sim.vehicle import ROLLING_FROM_MPS
 
 _R0, _R1, _R2 = THETA_R
+NO_COMMAND = TorqueCommand(0.0, 0.0, 0.0)
 _DQ_THETA0 = float(THETA_GRID[0])
 _TICKS_PER_SERVO = round(1.0 / DT_S)
 
@@ -145,6 +146,7 @@ class CompiledEngine:
         derate: float,
         rule: tuple[float, float],
         stop: bool,
+        command: TorqueCommand | None = None,
     ) -> NDArray[np.float64]:
         """Advance ``state`` and ``theta`` in place; return one row per tick done."""
         rows = np.empty((ticks, N_ROW))
@@ -158,6 +160,8 @@ class CompiledEngine:
             float(rule[0]),
             float(rule[1]),
             stop,
+            command is not None,
+            NO_COMMAND if command is None else TorqueCommand(*map(float, command)),
             self._scalars,
             self._tables,
             self._course,
@@ -320,7 +324,7 @@ def _thermal(theta, heat, speed, boundary, tab, out):
 
 
 @njit(cache=True, fastmath=False)
-def _run(ticks, tick, s, theta, boundary, derate, rule_start, rule_end, stop, c, tab, course, rows):
+def _run(ticks, tick, s, theta, boundary, derate, rule_start, rule_end, stop, obeys, order, c, tab, course, rows):
     """Advance the plant; return the number of ticks done."""
     heat, work = np.zeros(N_NODES), np.zeros(N_NODES)
     for step in range(ticks):
@@ -351,7 +355,12 @@ def _run(ticks, tick, s, theta, boundary, derate, rule_start, rule_end, stop, c,
 
         # Driver.
         wanted = friction = integral = 0.0
-        if v_ref > STANDSTILL_MPS or s[V] > STANDSTILL_MPS:
+        if obeys:
+            wanted = min(max(order.accelerate_nm, 0.0), drive_limit) + max(min(order.brake_nm, 0.0), -regen_limit)
+            friction = max(min(order.friction_nm, 0.0), c.u_min)
+            integral = wanted + friction - c.kp * (v_ref - s[V])
+            integral = min(max(integral, -c.integral_max), c.integral_max)
+        elif v_ref > STANDSTILL_MPS or s[V] > STANDSTILL_MPS:
             error = v_ref - s[V]
             wish = c.kp * error + s[INTEGRAL]
             u = min(max(wish, c.u_min), c.u_max)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant_sim.cycles import Cycle, CycleSpec, build_cycle
+from plant_sim.driver import TorqueCommand
 from plant_sim.errors import PlantStateError
 from plant_sim.faults import Fault, active_faults
 from plant_sim.lptn import DT_S
@@ -172,17 +173,19 @@ class Plant:
         """Change the surroundings from the next step on."""
         self._boundary[:] = coolant_degc, ambient_degc, gearbox_degc
 
-    def step(self, derate: float = 1.0) -> PlantSample:
-        """Advance by 10 ms under a derating factor and return the new sample.
+    def step(self, derate: float = 1.0, command: TorqueCommand | None = None) -> PlantSample:
+        """Advance by 10 ms under a derating factor, or obeying a command, and return the new sample.
 
-        Past the cycle's end the plant goes on with the last reference; ``done`` stays true.
+        Past the cycle's end the plant goes on with the last reference; ``done`` stays true. A command replaces the
+        driver and is clipped to the envelope; derating is its sender's affair then. The driver follows what is
+        commanded, so that it can take over without a jump. At key-on the car stands, whatever is commanded.
 
         Raises
         ------
         PlantStateError
-            If the factor is not within 0..1.
+            If the factor is not within 0..1, or a commanded torque is not finite.
         """
-        row, measured = self._advance(1, derate, NO_RULE, False)
+        row, measured = self._advance(1, derate, NO_RULE, False, command)
         r = row[0]
         meas_w, meas_r = measured[0].tolist() if measured.size else (None, None)
         fault_w, fault_r = self.active_faults(self._tick * DT_S)
@@ -223,16 +226,29 @@ class Plant:
         """Advance up to ``ticks`` steps (``stop``: to the cycle's end); return their rows (n, 8)."""
         return self._advance(ticks, derate, rule_degc, stop)[0]
 
+    def drive(
+        self, ticks: int, derate: float = 1.0, command: TorqueCommand | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Advance ``ticks`` steps as `step` would; return their rows (n, 8) and the sensor readings due (m, 2)."""
+        return self._advance(ticks, derate, NO_RULE, False, command)
+
     def _advance(
-        self, ticks: int, derate: float, rule: tuple[float, float], stop: bool
+        self,
+        ticks: int,
+        derate: float,
+        rule: tuple[float, float],
+        stop: bool,
+        command: TorqueCommand | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if not 0.0 <= derate <= 1.0:
             raise PlantStateError(f"derating factor {derate} is outside 0..1")
+        if command is not None and not np.isfinite(command).all():
+            raise PlantStateError(f"{command}: a commanded torque is not finite; send no command instead")
         standing = min(max(self._key_on_ticks - self._tick, 0), ticks)
-        rows = self._run(self._standing, standing, self._tick, derate, rule, False)
+        rows = self._run(self._standing, standing, self._tick, derate, rule, False, None)
         if ticks > standing or not standing:
             driven = self._tick + standing - self._key_on_ticks
-            moving = self._run(self._engine, ticks - standing, driven, derate, rule, stop)
+            moving = self._run(self._engine, ticks - standing, driven, derate, rule, stop, command)
             rows = np.concatenate([rows, moving]) if standing else moving
         first = -(self._tick + 1) % TICKS_PER_SAMPLE
         self._tick += rows.shape[0]
@@ -240,9 +256,16 @@ class Plant:
         return rows, self._sensor.sample(due) if due.size else due
 
     def _run(
-        self, engine, ticks: int, tick: int, derate: float, rule: tuple[float, float], stop: bool
+        self,
+        engine,
+        ticks: int,
+        tick: int,
+        derate: float,
+        rule: tuple[float, float],
+        stop: bool,
+        command: TorqueCommand | None,
     ) -> NDArray[np.float64]:
-        return engine.run(ticks, tick, self._state, self._theta, self._boundary, derate, rule, stop)
+        return engine.run(ticks, tick, self._state, self._theta, self._boundary, derate, rule, stop, command)
 
     def _theta_pair(self) -> NDArray[np.float64]:
         t = self._theta

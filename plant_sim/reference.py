@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from plant_sim.cycles import Cycle
 from plant_sim.dq_map import build_dq_map
-from plant_sim.driver import driver_step
+from plant_sim.driver import TorqueCommand, driver_step, linear_share, obey
 from plant_sim.losses import LossModel
 from plant_sim.lptn import DT_S, build_lptn
 from plant_sim.network import build_network
@@ -47,6 +47,7 @@ class ReferenceEngine:
         derate: float,
         rule: tuple[float, float],
         stop: bool,
+        command: TorqueCommand | None = None,
     ) -> NDArray[np.float64]:
         """Advance ``state`` (5,) and ``theta`` (70,) in place; return one row (8) per tick done.
 
@@ -63,12 +64,13 @@ class ReferenceEngine:
             off.
         stop
             Return early when the cycle's end is reached.
+        command
+            Torques to obey within the envelope instead of the driver; derating is then the sender's affair.
         """
         rows = np.empty((ticks, N_ROW))
         for k in range(ticks):
-            rows[k] = self._step(
-                tick + k, state, theta, boundary, derate * linear_derate(theta[THETA_W], rule)
-            )
+            factor = derate * linear_derate(theta[THETA_W], rule)
+            rows[k] = self._step(tick + k, state, theta, boundary, factor, command)
             if stop and self._cycle.done((tick + k + 1) * DT_S, state[X]):
                 return rows[: k + 1]
         return rows
@@ -80,6 +82,7 @@ class ReferenceEngine:
         theta: NDArray[np.float64],
         boundary: NDArray[np.float64],
         derate: float,
+        order: TorqueCommand | None,
     ) -> tuple[float, ...]:
         p, cycle = self._params, self._cycle
         v_ref, slope = cycle.reference(tick * DT_S, s[X], p.driver.lookahead_m)
@@ -89,7 +92,10 @@ class ReferenceEngine:
         speed = motor_speed_rpm(s[V], p.vehicle)
         drive_limit = motoring_limit_nm(speed, p.machine)
         regen_limit = regen_limit_nm(speed, s[V], p.machine)
-        command = driver_step(s[V], v_ref, s[INTEGRAL], drive_limit, regen_limit, derate, DT_S, p.driver)
+        if order is None:
+            command = driver_step(s[V], v_ref, s[INTEGRAL], drive_limit, regen_limit, derate, DT_S, p.driver)
+        else:
+            command = obey(order, s[V], v_ref, drive_limit, regen_limit, p.driver)
         lagged = self._lag * s[TORQUE] + (1.0 - self._lag) * (command.drive_nm + command.regen_nm)
         torque = min(max(lagged, -regen_limit), drive_limit)
 
@@ -114,4 +120,4 @@ class ReferenceEngine:
 def linear_derate(theta_w_degc: float, rule: tuple[float, float]) -> float:
     """Linear rule: 1 below start, 0 above end (degC); 1 if switched off."""
     start, end = rule
-    return min(max((end - theta_w_degc) / (end - start), 0.0), 1.0) if end > start else 1.0
+    return linear_share(theta_w_degc, start, end) if end > start else 1.0
