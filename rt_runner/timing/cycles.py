@@ -43,7 +43,7 @@ class CycleRow:
     of a run and one interruption do not change a rate. ``longest_ms`` counts the silences at both ends, too: from its
     node's first frame on, and up to its node's last one, or the log's end less a second. ``longest_from_ns`` is the
     stamp it began at. ``missing`` is how many cycles passed without a frame, ``timeouts`` how often it was silent for
-    longer than ``timeout_ms``; a message that never came although its node spoke is one timeout if that was long enough.
+    longer than ``timeout_ms``; one that never came although its node spoke long enough is one timeout.
     """
 
     name: str
