@@ -4,7 +4,7 @@
 #include <stddef.h>
 #include <string.h>
 
-_Static_assert(sizeof(est_cycle) <= 600000, "est_cycle.h says so");
+_Static_assert(sizeof(est_cycle) <= 800000, "est_cycle.h says so");
 _Static_assert((int)EST_CYCLE_FRAMES_PER_JOB <= 11, "send queue of a CAN interface and its controller: more would be lost");
 
 static const int64_t NS_PER_S = 1000000000;

@@ -1,6 +1,7 @@
 #include "rt_clock.h"
 
 #include <errno.h>
+#include <sched.h>
 #include <stddef.h>
 #include <time.h>
 
@@ -28,8 +29,13 @@ static bool sleep_until_ns(void *ctx, int64_t at_ns) {
     return clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &at, NULL) != EINTR;
 }
 
+static int cpu(void *ctx) {
+    (void)ctx;
+    return sched_getcpu();
+}
+
 rt_clock rt_clock_system(void) {
-    const rt_clock clock = {NULL, monotonic_ns, thread_cpu_ns, sleep_until_ns};
+    const rt_clock clock = {NULL, monotonic_ns, thread_cpu_ns, sleep_until_ns, cpu};
     return clock;
 }
 

@@ -12,9 +12,10 @@ typedef struct {
     int64_t (*now_ns)(void *ctx);                      /* monotonic time */
     int64_t (*thread_cpu_ns)(void *ctx);               /* processor time the calling thread has used */
     bool (*sleep_until_ns)(void *ctx, int64_t at_ns);  /* true: `at_ns` reached; false: a signal came first */
+    int (*cpu)(void *ctx);                             /* the core the caller runs on, -1: unknown; NULL: not asked */
 } rt_clock;
 
-/* CLOCK_MONOTONIC, CLOCK_THREAD_CPUTIME_ID and clock_nanosleep with an absolute time. Cannot fail on Linux. */
+/* CLOCK_MONOTONIC, CLOCK_THREAD_CPUTIME_ID, clock_nanosleep with an absolute time, sched_getcpu. Cannot fail on Linux. */
 rt_clock rt_clock_system(void);
 
 /* CLOCK_REALTIME, the clock of the kernel's receive stamps. About 30 ns. */

@@ -107,13 +107,17 @@ typedef struct {
     bool lock;
 } answers;
 
-/* Each thing that was granted is looked at by itself: a container may say yes and do nothing. */
-static void read_back(const rt_request *request, const answers *yes, rt_granted *granted) {
+static void read_back_thread(rt_granted *granted) {
     const int policy = sched_getscheduler(0);
     granted->policy = policy == SCHED_FIFO ? RT_POLICY_FIFO : policy == SCHED_RR ? RT_POLICY_RR : RT_POLICY_OTHER;
     struct sched_param param = {0};
     granted->priority = sched_getparam(0, &param) == 0 ? param.sched_priority : 0;
     granted->core = pinned_core();
+}
+
+/* Each thing that was granted is looked at by itself: a container may say yes and do nothing. */
+static void read_back(const rt_request *request, const answers *yes, rt_granted *granted) {
+    read_back_thread(granted);
     granted->locked_kb = proc_number("/proc/self/status", "VmLck:");
     granted->mlock = yes->lock && granted->locked_kb > 0;
     if (yes->lock && !granted->mlock) {
@@ -129,8 +133,8 @@ static void read_back(const rt_request *request, const answers *yes, rt_granted 
     }
 }
 
-void rt_grant_apply(const rt_request *request, rt_granted *granted) {
-    memset(granted, 0, sizeof *granted);
+/* What belongs to the calling thread alone. */
+static answers raise_thread(const rt_request *request, rt_granted *granted) {
     answers yes = {false, false, false};
     if (request->core >= 0) {
         yes.core = pin(request->core, granted);
@@ -142,15 +146,29 @@ void rt_grant_apply(const rt_request *request, rt_granted *granted) {
             rt_grant_warn(granted, "SCHED_FIFO priority %d refused (%s): needs CAP_SYS_NICE or an rtprio limit; wake-ups will be later",
                  request->priority, strerror(errno));
         }
+    }
+    (void)prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL); /* 50 µs by default outside SCHED_FIFO */
+    rt_grant_flush_denormals();
+    return yes;
+}
+
+void rt_grant_thread(const rt_request *request, rt_granted *granted) {
+    memset(granted, 0, sizeof *granted);
+    (void)raise_thread(request, granted);
+    read_back_thread(granted);
+}
+
+void rt_grant_apply(const rt_request *request, rt_granted *granted) {
+    memset(granted, 0, sizeof *granted);
+    answers yes = raise_thread(request, granted);
+    if (request->real_time) {
         yes.lock = mlockall(MCL_CURRENT | MCL_FUTURE) == 0;
         if (!yes.lock) {
             rt_grant_warn(granted, "mlockall refused (%s): needs CAP_IPC_LOCK or a larger memlock limit; page faults are possible",
                  strerror(errno));
         }
     }
-    (void)prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL); /* 50 µs by default outside SCHED_FIFO */
     prefault_stack();
-    rt_grant_flush_denormals();
     read_back(request, &yes, granted);
 }
 

@@ -43,6 +43,10 @@ typedef struct {
  * denormal numbers zero (FTZ/DAZ) and reads back what is now in force. Takes milliseconds; call once, before the loop. */
 void rt_grant_apply(const rt_request *request, rt_granted *granted);
 
+/* The same for a further thread of the process: core, SCHED_FIFO, timer slack, denormals; memory is locked by rt_grant_apply for
+ * all threads and the stack is left alone. `mlock` and `locked_kb` are not filled in. No file is opened. */
+void rt_grant_thread(const rt_request *request, rt_granted *granted);
+
 /* Adds a warning, shortened to RT_GRANT_WARNING_LENGTH - 1 characters; dropped when there are RT_GRANT_WARNINGS already. */
 __attribute__((format(printf, 2, 3))) void rt_grant_warn(rt_granted *granted, const char *format, ...);
 

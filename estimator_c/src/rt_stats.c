@@ -18,15 +18,19 @@ static size_t bucket_of(uint64_t value) {
     return ((size_t)(shift + 1U) << RT_STATS_SUB_BITS) + (size_t)((value >> shift) - SUB);
 }
 
+void rt_stats_bucket_bounds(size_t i, int64_t *low_ns, int64_t *high_ns) {
+    const size_t octave = i >> RT_STATS_SUB_BITS;
+    const int64_t slot = (int64_t)(i & (SUB - 1U));
+    const unsigned shift = octave == 0 ? 0 : (unsigned)(octave - 1U);
+    *low_ns = (octave == 0 ? slot : SUB + slot) * ((int64_t)1 << shift);
+    *high_ns = *low_ns + ((int64_t)1 << shift);
+}
+
 static int64_t bucket_middle(size_t bucket) {
-    const size_t octave = bucket >> RT_STATS_SUB_BITS;
-    const int64_t slot = (int64_t)(bucket & (SUB - 1U));
-    if (octave == 0) {
-        return slot;
-    }
-    const unsigned shift = (unsigned)(octave - 1U);
-    const int64_t low = (int64_t)((uint64_t)(SUB + slot) << shift);
-    return low + (((int64_t)1 << shift) - 1) / 2;
+    int64_t low_ns = 0;
+    int64_t high_ns = 0;
+    rt_stats_bucket_bounds(bucket, &low_ns, &high_ns);
+    return low_ns + (high_ns - low_ns - 1) / 2;
 }
 
 void rt_stats_init(rt_stats *self) {
@@ -78,6 +82,35 @@ rt_quantile_status rt_stats_quantile(const rt_stats *self, uint32_t per_10k, int
     }
     *value_ns = self->max_ns;
     return RT_QUANTILE_OVERFLOW;
+}
+
+void rt_stats_merge(rt_stats *self, const rt_stats *other) {
+    if (other->count == 0) {
+        return;
+    }
+    if (self->count == 0) {
+        *self = *other;
+        return;
+    }
+    if (other->min_ns < self->min_ns) {
+        self->min_ns = other->min_ns;
+        self->min_index = other->min_index;
+    }
+    if (other->max_ns > self->max_ns) {
+        self->max_ns = other->max_ns;
+        self->max_index = other->max_index;
+    }
+    const double here = (double)self->count;
+    const double there = (double)other->count;
+    const double apart = other->mean_ns - self->mean_ns;
+    self->mean_ns += apart * there / (here + there);
+    self->m2_ns2 += other->m2_ns2 + apart * apart * here * there / (here + there);
+    self->count += other->count;
+    self->underflow += other->underflow;
+    self->overflow += other->overflow;
+    for (size_t i = 0; i < RT_STATS_BUCKETS; i++) {
+        self->bucket[i] += other->bucket[i];
+    }
 }
 
 void rt_stats_summary(const rt_stats *self, rt_summary *out) {

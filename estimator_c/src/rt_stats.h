@@ -83,6 +83,13 @@ void rt_stats_add(rt_stats *self, int64_t value_ns, uint64_t index);
  * (1..9999). O(buckets). `*value_ns` is untouched when the answer is RT_QUANTILE_NA. */
 rt_quantile_status rt_stats_quantile(const rt_stats *self, uint32_t per_10k, int64_t *value_ns);
 
+/* What bucket `i` (below RT_STATS_BUCKETS) holds: low <= value < high. O(1). */
+void rt_stats_bucket_bounds(size_t i, int64_t *low_ns, int64_t *high_ns);
+
+/* Adds all values of `other`, as if they had come after those of `self`: of equal extremes the index of `self` stays. Mean and
+ * std to rounding (Chan). O(buckets). */
+void rt_stats_merge(rt_stats *self, const rt_stats *other);
+
 /* Everything at once. O(buckets); not meant for the loop. */
 void rt_stats_summary(const rt_stats *self, rt_summary *out);
 

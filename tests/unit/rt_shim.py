@@ -7,7 +7,10 @@ import subprocess
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = ("rt_stats.c", "rt_tally.c", "rt_task.c")
+SOURCES = tuple(
+    f"rt_{name}.c"
+    for name in ("stats", "tally", "task", "reaction", "backlog", "cause", "theft", "canary", "clock", "grant")
+)
 QUANTILE_PER_10K = (5000, 9000, 9900, 9990, 9999)
 I64 = ct.c_int64
 U64 = ct.c_uint64
@@ -17,6 +20,16 @@ def _structure(name: str, fields: list[tuple[str, type]]) -> type[ct.Structure]:
     return type(name, (ct.Structure,), {"_fields_": fields})
 
 
+Reaction = _structure(
+    "Reaction",
+    [
+        ("overrun", ct.c_int),
+        ("queue_limit", ct.c_uint32),
+        ("budget_ns", I64),
+        ("stop_total", U64),
+        ("stop_row", U64),
+    ],
+)
 Config = _structure(
     "Config",
     [
@@ -25,6 +38,10 @@ Config = _structure(
         ("t0_ns", I64),
         ("warmup_releases", U64),
         ("virtual_time", ct.c_bool),
+        ("on_event", ct.c_bool),
+        ("reaction", Reaction),
+        ("mk_m", ct.c_uint32),
+        ("mk_k", ct.c_uint32),
     ],
 )
 SCRIPT_FIELDS = (
@@ -97,6 +114,7 @@ def build(directory: Path) -> ct.CDLL:
             str(Path(__file__).with_name("rt_task_shim.c")),
             *(str(source / name) for name in SOURCES),
             "-lm",
+            "-lpthread",
         ],
         check=True,
     )

@@ -62,7 +62,7 @@ int shim_run(const rt_task_config *config, int64_t now_ns, const script *steps, 
              rt_summary *wake_lat) {
     rt_task *task = malloc(sizeof *task);
     world w = {.now_ns = now_ns};
-    const rt_clock clock = {&w, world_now, world_cpu, world_sleep};
+    const rt_clock clock = {&w, world_now, world_cpu, world_sleep, NULL};
     if (task == NULL || rt_task_init(task, config, &clock) != RT_TASK_OK) {
         free(task);
         return -1;
@@ -104,7 +104,7 @@ int shim_run(const rt_task_config *config, int64_t now_ns, const script *steps, 
 int shim_init(const rt_task_config *config) {
     static rt_task task;
     world w = {0};
-    const rt_clock clock = {&w, world_now, world_cpu, world_sleep};
+    const rt_clock clock = {&w, world_now, world_cpu, world_sleep, NULL};
     return (int)rt_task_init(&task, config, &clock);
 }
 
