@@ -6,7 +6,7 @@ from typing import IO, NamedTuple
 
 RECORD = struct.Struct("=qIB3x8s")  # t_ns, then struct can_frame: id, length, padding, data
 CONTROL_ID = 0x20000000  # CAN_ERR_FLAG: no data frame can have it
-TICK, END = 1, 2
+TICK, END, JOB = 1, 2, 3
 
 
 class Record(NamedTuple):
@@ -25,6 +25,11 @@ def pack(t_ns: int, can_id: int, data: bytes) -> bytes:
 def control(t_ns: int, code: int) -> bytes:
     """A control record: ``TICK`` (time has advanced to ``t_ns``) or ``END``."""
     return pack(t_ns, CONTROL_ID, bytes([code]))
+
+
+def job(t_ns: int, release: int) -> bytes:
+    """The control record of replay: the job of release number ``release`` read its inputs at ``t_ns``."""
+    return pack(t_ns, CONTROL_ID, bytes([JOB]) + release.to_bytes(4, "little"))
 
 
 def read_until_control(stream: IO[bytes]) -> Iterator[Record]:

@@ -27,7 +27,10 @@ typedef struct {
     int64_t period_us;
     rt_request request;
     bool lockstep;
+    bool replay; /* lock-step where the records say which job ran when */
 } options;
+
+static const int64_t REPLAY_MAX_NS = INT64_C(1) << 61; /* 73 years to both sides: differences do not overflow */
 
 /* All of the process's large state, out of the stack and locked with the rest. */
 static est_cycle cycle;
@@ -64,7 +67,8 @@ static bool was_written(const char *what) {
 static void usage(FILE *out) {
     (void)fputs("usage: rt_estimator --bus socketcan:IFACE|rt_hub:PATH [--setting NAME] [--period-us 1000..1000000]\n"
                 "                    [--core N] [--priority 1..99] [--no-rt]\n"
-                "       rt_estimator --lockstep [--setting NAME] [--period-us …]   records on stdin and stdout\n",
+                "       rt_estimator --lockstep [--setting NAME] [--period-us …]   records on stdin and stdout\n"
+                "       rt_estimator --replay [--setting NAME] [--period-us …]     the same, and they say when each job ran\n",
                 out);
 }
 
@@ -91,6 +95,7 @@ static int parse(int argc, char **argv, options *opt) {
         {"period-us", required_argument, NULL, 't'}, {"core", required_argument, NULL, 'c'},
         {"priority", required_argument, NULL, 'p'},  {"no-rt", no_argument, NULL, 'n'},
         {"lockstep", no_argument, NULL, 'l'},        {"help", no_argument, NULL, 'h'},
+        {"replay", no_argument, NULL, 'r'},
         {NULL, 0, NULL, 0},
     };
     const char *setting = "default";
@@ -131,6 +136,10 @@ static int parse(int argc, char **argv, options *opt) {
         case 'l':
             opt->lockstep = true;
             break;
+        case 'r':
+            opt->lockstep = true;
+            opt->replay = true;
+            break;
         case 'h':
             usage(stdout);
             (void)fflush(stdout);
@@ -147,7 +156,7 @@ static int parse(int argc, char **argv, options *opt) {
         return bad_setting(setting);
     }
     if (opt->lockstep == (opt->bus != NULL)) {
-        return fail("give either --bus socketcan:IFACE, --bus rt_hub:PATH or --lockstep; see rt_estimator --help");
+        return fail("give either --bus socketcan:IFACE, --bus rt_hub:PATH, --lockstep or --replay; see rt_estimator --help");
     }
     if (opt->lockstep) {
         opt->request.real_time = false; /* it waits for its input, not for a clock */
@@ -281,17 +290,47 @@ static int bad_input(rt_record_status status) {
                 status == RT_RECORD_TRUNCATED ? "inside a record, before" : "without");
 }
 
-/* Handles one record. *done at END. Returns an exit status, or -1 to go on. */
-static int handle(const est_io *io, const rt_record *record, bool *done) {
-    const bool control = record->frame.can_id == RT_RECORD_CONTROL_ID;
-    const uint8_t code = record->frame.data[0];
+static int reader_left(void) {
+    return fail("stdout: %s; the program that reads it has stopped", strerror(errno));
+}
+
+/* The releases before the record's time, as far as they are not named by the records themselves. -1: go on. */
+static int pass_time(const options *opt, const rt_record *record, bool tick) {
+    if (opt->replay) { /* frames carry the time they arrived at, jobs the time they ran: their order is the log's */
+        const bool sane = record->t_ns > -REPLAY_MAX_NS && record->t_ns < REPLAY_MAX_NS;
+        return sane ? -1 : fail("stdin: record time %lld ns; give times since the start of the grid", (long long)record->t_ns);
+    }
     const est_lockstep_status time = est_lockstep_advance(&lockstep, record->t_ns);
     if (time != EST_LOCKSTEP_OK) {
         return fail("stdin: record time %s from %lld to %lld ns; records must come in order of time",
                     time == EST_LOCKSTEP_JUMP ? "leaps" : "goes back", (long long)lockstep.last_ns, (long long)record->t_ns);
     }
-    est_cycle_status status = run_releases(record->t_ns, control && code == RT_RECORD_TICK);
-    if (status == EST_CYCLE_OK && control && (code == RT_RECORD_TICK || code == RT_RECORD_END)) {
+    return run_releases(record->t_ns, tick) == EST_CYCLE_OK ? -1 : reader_left();
+}
+
+static int replay_job(const rt_record *record) {
+    const uint8_t *bytes = record->frame.data;
+    const uint32_t index = (uint32_t)bytes[1] | (uint32_t)bytes[2] << 8 | (uint32_t)bytes[3] << 16 | (uint32_t)bytes[4] << 24;
+    if (index <= cycle.task.last_index) {
+        return fail("stdin: release %lu comes after release %lu; jobs are replayed in their order", (unsigned long)index,
+                    (unsigned long)cycle.task.last_index);
+    }
+    return est_cycle_run_replayed(&cycle, index, record->t_ns) == EST_CYCLE_OK ? -1 : reader_left();
+}
+
+/* Handles one record. *done at END. Returns an exit status, or -1 to go on. */
+static int handle(const options *opt, const est_io *io, const rt_record *record, bool *done) {
+    const bool control = record->frame.can_id == RT_RECORD_CONTROL_ID;
+    const uint8_t code = record->frame.data[0];
+    est_cycle_status status = EST_CYCLE_OK;
+    const int exit_status = pass_time(opt, record, control && code == RT_RECORD_TICK);
+    if (exit_status != -1) {
+        return exit_status;
+    }
+    if (control && code == RT_RECORD_JOB && opt->replay) {
+        return replay_job(record);
+    }
+    if (control && (code == RT_RECORD_TICK || code == RT_RECORD_END)) {
         if (code == RT_RECORD_END) {
             io->begin(io->ctx, record->t_ns);
             status = est_cycle_send_final(&cycle);
@@ -300,10 +339,10 @@ static int handle(const est_io *io, const rt_record *record, bool *done) {
         if (rt_record_control(&lockstep.writer, record->t_ns, code) != RT_RECORD_OK) {
             status = EST_CYCLE_GONE;
         }
-    } else if (status == EST_CYCLE_OK) {
+    } else {
         est_lockstep_push(&lockstep, record);
     }
-    return status == EST_CYCLE_OK ? -1 : fail("stdout: %s; the program that reads it has stopped", strerror(errno));
+    return status == EST_CYCLE_OK ? -1 : reader_left();
 }
 
 static int run_lockstep(const options *opt) {
@@ -323,7 +362,7 @@ static int run_lockstep(const options *opt) {
     while (exit_status == -1 && !done) {
         rt_record record;
         const rt_record_status status = rt_record_read(&lockstep.reader, &record);
-        exit_status = status == RT_RECORD_OK ? handle(&io, &record, &done) : bad_input(status);
+        exit_status = status == RT_RECORD_OK ? handle(opt, &io, &record, &done) : bad_input(status);
         if (!run.warm_valid && cycle.task.last_index >= cycle.task.config.warmup_releases) {
             rt_environment_read(&run.warm, false);
             run.warm_valid = true;

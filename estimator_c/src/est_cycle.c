@@ -236,9 +236,8 @@ static est_cycle_status housekeeping(est_cycle *self, const rt_job *job) {
     return send_all(self, frames, count);
 }
 
-static est_cycle_status run(est_cycle *self, rt_job *job) {
-    /* In lock-step record time stands still while a job runs; in real time "now" is when we woke. */
-    const int64_t now_ns = self->task.config.virtual_time ? job->release_ns : job->start_ns;
+/* `now_ns`: when the inputs are read. In lock-step record time stands still while a job runs; in real time it is when we woke. */
+static est_cycle_status run(est_cycle *self, rt_job *job, int64_t now_ns) {
     estimator_out_t out;
     bool sent = false;
     self->io.begin(self->io.ctx, now_ns);
@@ -270,11 +269,18 @@ est_cycle_status est_cycle_wait_and_run(est_cycle *self) {
     if (rt_task_wait(&self->task, &job) != RT_TASK_OK) {
         return EST_CYCLE_INTERRUPTED;
     }
-    return run(self, &job);
+    return run(self, &job, job.start_ns);
 }
 
 est_cycle_status est_cycle_run_released(est_cycle *self) {
     rt_job job;
     rt_task_release(&self->task, &job);
-    return run(self, &job);
+    return run(self, &job, job.release_ns);
+}
+
+est_cycle_status est_cycle_run_replayed(est_cycle *self, uint64_t index, int64_t now_ns) {
+    rt_job job;
+    self->task.next_index = index;
+    rt_task_release(&self->task, &job);
+    return run(self, &job, now_ns);
 }

@@ -69,6 +69,10 @@ est_cycle_status est_cycle_wait_and_run(est_cycle *self);
 /* Lock-step: runs the job of the next release, whose time is rt_task_next_release_ns. */
 est_cycle_status est_cycle_run_released(est_cycle *self);
 
+/* Replay (virtual time): runs the job of release `index`, after the one before, that read its inputs at `now_ns`. Releases
+ * left out have no job. The same frames with the same arrival times give the same estimates as they did in real time. */
+est_cycle_status est_cycle_run_replayed(est_cycle *self, uint64_t index, int64_t now_ns);
+
 /* The counters as they are published. O(1). */
 void est_cycle_counters(const est_cycle *self, est_counters *out);
 

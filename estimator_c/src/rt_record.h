@@ -14,6 +14,7 @@ enum {
     RT_RECORD_CONTROL_ID = 0x20000000, /* CAN_ERR_FLAG alone: no data frame can have it */
     RT_RECORD_TICK = 1,                /* time has advanced to t_ns, everything before has been delivered */
     RT_RECORD_END = 2,
+    RT_RECORD_JOB = 3,                 /* replay: a job read its inputs at t_ns; data[1..4]: its release, little endian */
     RT_RECORD_BUFFER = 64 * 1024
 };
 
