@@ -82,9 +82,14 @@ def run_realtime(args) -> int:
                 ahead_ns = due_ns - time.monotonic_ns()
                 if ahead_ns > 0:
                     time.sleep(ahead_ns / 1e9)
+                sample_ns, before_ns = time.time_ns(), time.monotonic_ns()
                 sample = plant.step()
-                for message in publisher.frames(sample):
+                motor_state, *others = publisher.frames(sample)
+                _send(bus, motor_state, publisher)
+                send_ns = time.monotonic_ns() - before_ns
+                for message in others:
                     _send(bus, message, publisher)
+                _send(bus, publisher.sampled(sample.tick, sample_ns, send_ns), publisher)
                 late_ns = time.monotonic_ns() - due_ns
                 if late_ns > TICK_NS:
                     publisher.ticks_late += 1

@@ -6,6 +6,10 @@ from plant_sim.plant import PlantSample
 from rt_runner.codec import Encoder
 from rt_runner.dbc import Dbc
 
+SAMPLE_MODULUS_US = 1 << 24
+SAMPLE_LAST_US = SAMPLE_MODULUS_US - 2  # the last code says "not available": there the time reads 1 us early
+SEND_LAST_US = (1 << 12) - 2
+
 
 class Publisher:
     """Turns plant samples into frames at the DBC's cycle times.
@@ -64,3 +68,22 @@ class Publisher:
         if first or (s.tick - self._first_tick) % 1000 == 0:
             out.append(self._encode("PlantIdentity", self._identity))
         return out
+
+    def sampled(self, tick: int, sample_ns: int, send_ns: int) -> can.Message:
+        """PlantSample, the last frame of a tick in real time.
+
+        Parameters
+        ----------
+        tick : of the sample
+        sample_ns : CLOCK_REALTIME when the sample was taken
+        send_ns : from then until MotorState was handed to the bus
+        """
+        send_us = send_ns // 1000
+        return self._encode(
+            "PlantSample",
+            {
+                "sample_us": min(sample_ns // 1000 % SAMPLE_MODULUS_US, SAMPLE_LAST_US),
+                "send_us": send_us if 0 <= send_us <= SEND_LAST_US else None,
+                "tick": tick % 65536,
+            },
+        )

@@ -117,6 +117,7 @@ est_bus_verdict est_bus_accept(est_bus *self, const struct canfd_frame *frame, i
         rx->unavailable++;
     }
     self->accepted++;
+    rx->used_ns = at_ns;
     if (id == EST_RX_MOTOR_STATE && rx->alive && out->tick == rx->last_tick) {
         return EST_BUS_INPUT; /* the sender lives, what it sends stands still: let it grow stale */
     }
@@ -147,6 +148,12 @@ bool est_bus_stale(est_bus *self, int64_t now_ns, uint64_t index) {
     return any;
 }
 
+int64_t est_bus_in_age_ns(const est_bus *self, est_rx_id id, int64_t now_ns) {
+    const est_rx *rx = &self->rx[id];
+    const int64_t age_ns = now_ns - rx->used_ns;
+    return !rx->alive ? TIMING_NA : age_ns < 0 ? 0 : age_ns;
+}
+
 void est_bus_read_faults(const est_bus *self, est_bus_faults *out) {
     memset(out, 0, sizeof *out);
     for (int i = 0; i < EST_RX_COUNT; i++) {
@@ -163,15 +170,9 @@ void est_bus_read_faults(const est_bus *self, est_bus_faults *out) {
 #define SEAL(self, index, name, raw, frame)                                              \
     do {                                                                                 \
         memset((frame), 0, sizeof *(frame));                                             \
-        (frame)->can_id = drive_messages[index].can_id;                                  \
-        (frame)->len = drive_messages[index].length;                                     \
         (void)drive_##name##_pack((frame)->data, &(raw), sizeof(frame)->data);           \
-        (void)e2e_protect(&(self)->tx[index], (frame)->data, (frame)->len);              \
+        timing_frames_seal((self)->tx, index, frame);                                    \
     } while (0)
-
-static double us_of(int64_t ns) {
-    return ns < 0 ? (double)NAN : (double)ns * 1e-3;
-}
 
 void est_bus_estimate(est_bus *self, const est_output *in, struct canfd_frame *frame) {
     struct drive_estimate_t raw;
@@ -232,42 +233,8 @@ void est_bus_rotor(est_bus *self, const est_output *in, struct canfd_frame *fram
     SEAL(self, DRIVE_INDEX_EST_ROTOR, est_rotor, raw, frame);
 }
 
-void est_bus_timing_a(est_bus *self, const est_timing *in, struct canfd_frame *frame) {
-    struct drive_est_timing_a_t raw;
-    memset(&raw, 0, sizeof raw);
-    raw.miss_late = in->miss_late ? 1U : 0U;
-    raw.warmup = in->warmup ? 1U : 0U;
-    raw.stale_input = in->stale_input ? 1U : 0U;
-    raw.after_skip = in->after_skip ? 1U : 0U;
-    raw.release_index = (uint32_t)((uint64_t)in->release_index & 0xFFFFFFU); /* wraps: 4.7 h at 1 ms */
-    raw.wake_lat_us = drive_est_timing_a_wake_lat_us_to_raw(us_of(in->wake_lat_ns));
-    SEAL(self, DRIVE_INDEX_EST_TIMING_A, est_timing_a, raw, frame);
-}
-
-void est_bus_timing_b(est_bus *self, const est_timing *in, struct canfd_frame *frame) {
-    struct drive_est_timing_b_t raw;
-    memset(&raw, 0, sizeof raw);
-    raw.miss_cause = drive_est_timing_b_miss_cause_to_raw((double)in->miss_cause);
-    raw.exec_wall_us = drive_est_timing_b_exec_wall_us_to_raw(us_of(in->exec_wall_ns));
-    raw.resp_us = drive_est_timing_b_resp_us_to_raw(us_of(in->resp_ns));
-    SEAL(self, DRIVE_INDEX_EST_TIMING_B, est_timing_b, raw, frame);
-}
-
-static void releases(est_bus *self, const est_counters *in, struct canfd_frame *frame) {
-    struct drive_est_releases_t raw;
-    memset(&raw, 0, sizeof raw);
-    raw.releases = drive_est_releases_releases_to_raw((double)in->releases);
-    raw.jobs = drive_est_releases_jobs_to_raw((double)in->jobs);
-    SEAL(self, DRIVE_INDEX_EST_RELEASES, est_releases, raw, frame);
-}
-
-static void misses(est_bus *self, const est_counters *in, struct canfd_frame *frame) {
-    struct drive_est_misses_t raw;
-    memset(&raw, 0, sizeof raw);
-    raw.miss_late = drive_est_misses_miss_late_to_raw((double)in->miss_late);
-    raw.miss_skipped = drive_est_misses_miss_skipped_to_raw((double)in->miss_skipped);
-    raw.overrun = drive_est_misses_overrun_to_raw((double)in->overrun);
-    SEAL(self, DRIVE_INDEX_EST_MISSES, est_misses, raw, frame);
+void est_bus_timing(est_bus *self, const timing_job *in, struct canfd_frame frames[TIMING_JOB_FRAMES]) {
+    timing_frames_job(&timing_frames_estimator, self->tx, in, frames);
 }
 
 static void input_faults(est_bus *self, const est_counters *in, struct canfd_frame *frame) {
@@ -321,9 +288,15 @@ static void calibration(est_bus *self, const est_counters *in, struct canfd_fram
 }
 
 void est_bus_counter(est_bus *self, size_t which, const est_counters *in, struct canfd_frame *frame) {
-    static void (*const make[EST_COUNTER_FRAMES])(est_bus *, const est_counters *, struct canfd_frame *) = {
-        releases, misses, input_faults, bus_faults, core_faults, core_faults2, calibration};
-    make[which](self, in, frame);
+    enum { BEFORE = 2 }; /* timing frames whose ids come first */
+    static void (*const make[EST_OWN_COUNTER_FRAMES])(est_bus *, const est_counters *, struct canfd_frame *) = {
+        input_faults, bus_faults, core_faults, core_faults2, calibration};
+    if (which >= BEFORE && which < BEFORE + EST_OWN_COUNTER_FRAMES) {
+        make[which - BEFORE](self, in, frame);
+        return;
+    }
+    const size_t timing = which < BEFORE ? which : which - EST_OWN_COUNTER_FRAMES;
+    timing_frames_counter(&timing_frames_estimator, self->tx, timing, &in->timing, frame);
 }
 
 static void hashes(est_bus *self, const est_identity *in, struct canfd_frame *frame) {

@@ -18,6 +18,7 @@
 #include "e2e.h"
 #include "estimator.h"
 #include "rt_stats.h"
+#include "timing_frames.h"
 
 /* The messages the estimator listens to. */
 typedef enum { EST_RX_MOTOR_STATE = 0, EST_RX_TEMP_MEAS = 1, EST_RX_COOLANT = 2, EST_RX_COUNT = 3 } est_rx_id;
@@ -60,6 +61,7 @@ typedef struct {
     uint64_t unavailable;   /* usable frames with a value not available that we use */
     uint16_t last_tick;     /* of the last usable frame */
     int64_t last_ns;        /* arrival of the last usable frame that brought news; MotorState: its tick had moved */
+    int64_t used_ns;        /* arrival of the last usable frame */
     rt_stats gap_ns;        /* between such frames */
     rt_stats age_ns;        /* of the newest such frame when a job looked */
 } est_rx;
@@ -92,21 +94,9 @@ typedef struct {
     estimator_channel_t channel[MHE_CHANNELS];
 } est_output;
 
-typedef struct {
-    bool miss_late;
-    bool warmup;
-    bool stale_input;
-    bool after_skip;
-    uint8_t miss_cause;
-    uint64_t release_index;
-    int64_t wake_lat_ns;    /* negative: not available */
-    int64_t exec_wall_ns;
-    int64_t resp_ns;
-} est_timing;
-
 /* Counters as published, and the calibration that goes with them; each saturates at its last valid code. */
 typedef struct {
-    uint64_t releases, jobs, miss_late, miss_skipped, overrun;
+    timing_counters timing;
     uint64_t crc_errors, seq_errors, stale_inputs;
     uint64_t rx_drops, tx_drops, rejected;
     uint64_t restarts, held_intervals, late_measurements, stray_ticks;
@@ -143,6 +133,10 @@ static inline bool est_bus_is_stale(const est_bus *self, est_rx_id id) {
     return self->rx[id].stale;
 }
 
+/* From the arrival of the newest usable frame of this message until `now_ns`, never negative; TIMING_NA before the first. Also
+ * a frame that brought no news counts: it is what the estimator was fed last. O(1). */
+int64_t est_bus_in_age_ns(const est_bus *self, est_rx_id id, int64_t now_ns);
+
 /* Sum of the fault counters. O(1). */
 void est_bus_read_faults(const est_bus *self, est_bus_faults *out);
 
@@ -153,12 +147,11 @@ void est_bus_innov(est_bus *self, const est_output *in, struct canfd_frame *fram
 void est_bus_validity(est_bus *self, const est_output *in, struct canfd_frame *frame);
 void est_bus_winding(est_bus *self, const est_output *in, struct canfd_frame *frame);
 void est_bus_rotor(est_bus *self, const est_output *in, struct canfd_frame *frame);
-void est_bus_timing_a(est_bus *self, const est_timing *in, struct canfd_frame *frame);
-void est_bus_timing_b(est_bus *self, const est_timing *in, struct canfd_frame *frame);
+void est_bus_timing(est_bus *self, const timing_job *in, struct canfd_frame frames[TIMING_JOB_FRAMES]);
 
-enum { EST_COUNTER_FRAMES = 7, EST_IDENTITY_FRAMES = 3 };
-/* Frame `which` (below EST_COUNTER_FRAMES) of EstReleases, EstMisses, EstInputFaults, EstBusFaults, EstCoreFaults,
- * EstCoreFaults2, EstCalibration. */
+enum { EST_OWN_COUNTER_FRAMES = 5, EST_COUNTER_FRAMES = EST_OWN_COUNTER_FRAMES + TIMING_COUNTER_FRAMES, EST_IDENTITY_FRAMES = 3 };
+/* Frame `which` (below EST_COUNTER_FRAMES) in the order of their ids: EstReleases, EstMisses, EstInputFaults, EstBusFaults,
+ * EstCoreFaults, EstCoreFaults2, EstCalibration, EstOverload, … EstRespStat (timing_frames.h). */
 void est_bus_counter(est_bus *self, size_t which, const est_counters *in, struct canfd_frame *frame);
 /* Frame `which` (below EST_IDENTITY_FRAMES) of EstIdentity, EstBuild, EstGranted. */
 void est_bus_identity(est_bus *self, size_t which, const est_identity *in, struct canfd_frame *frame);

@@ -140,22 +140,56 @@ static est_cycle_status publish(est_cycle *self, const est_output *output, bool 
     return send_all(self, more, 4);
 }
 
-static est_cycle_status publish_timing(est_cycle *self, const rt_job *job, bool stale) {
-    const est_timing timing = {
+static est_cycle_status publish_timing(est_cycle *self, const rt_job *job, bool stale, int64_t now_ns) {
+    const timing_job timing = {
         .miss_late = job->miss_late,
         .warmup = job->warmup,
         .stale_input = stale,
         .after_skip = job->after_skip,
         .miss_cause = (uint8_t)job->cause,
+        .output = TIMING_OUTPUT_COMPUTED,
         .release_index = job->index,
         .wake_lat_ns = job->wake_lat_ns,
         .exec_wall_ns = job->exec_wall_ns,
+        .exec_cpu_ns = job->exec_cpu_ns,
         .resp_ns = job->resp_ns,
+        .canary_ns = TIMING_NA,
+        .in_age_ns = {est_bus_in_age_ns(&self->bus, EST_RX_MOTOR_STATE, now_ns),
+                      est_bus_in_age_ns(&self->bus, EST_RX_TEMP_MEAS, now_ns)},
     };
-    struct canfd_frame frames[2];
-    est_bus_timing_a(&self->bus, &timing, &frames[0]);
-    est_bus_timing_b(&self->bus, &timing, &frames[1]);
-    return send_all(self, frames, 2);
+    struct canfd_frame frames[TIMING_JOB_FRAMES];
+    est_bus_timing(&self->bus, &timing, frames);
+    return send_all(self, frames, TIMING_JOB_FRAMES);
+}
+
+static timing_stat stat_of(const rt_stats *stats) {
+    enum { P99 = 9900 };
+    timing_stat out = {TIMING_NA, stats->count > 0 ? stats->max_ns : TIMING_NA};
+    if (rt_stats_quantile(stats, P99, &out.p99_ns) == RT_QUANTILE_NA) {
+        out.p99_ns = TIMING_NA;
+    }
+    return out;
+}
+
+static timing_counters timing_of(const est_cycle *self) {
+    const rt_tally *tally = &self->task.total;
+    const rt_stats *stats = self->task.stats;
+    const timing_counters out = {
+        .releases = tally->releases,
+        .jobs = tally->jobs,
+        .miss_late = tally->miss_late,
+        .miss_skipped = tally->miss_skipped,
+        .overrun = tally->overrun,
+        .consec_miss_max = tally->consec_miss_max,
+        .mk_worst = tally->mk_worst,
+        .run_delay_ns = TIMING_NA,
+        .steal_ns = TIMING_NA,
+        .canary = {TIMING_NA, TIMING_NA},
+        .wake = stat_of(&stats[RT_METRIC_WAKE_LAT]),
+        .exec = stat_of(&stats[RT_METRIC_EXEC_WALL]),
+        .resp = stat_of(&stats[RT_METRIC_RESP]),
+    };
+    return out;
 }
 
 void est_cycle_counters(const est_cycle *self, est_counters *out) {
@@ -163,14 +197,9 @@ void est_cycle_counters(const est_cycle *self, est_counters *out) {
     est_io_counters io;
     est_bus_read_faults(&self->bus, &faults);
     self->io.counters(self->io.ctx, &io);
-    const rt_tally *tally = &self->task.total;
     const estimator_counters_t *core = &self->estimator.counters;
     const est_counters counters = {
-        .releases = tally->releases,
-        .jobs = tally->jobs,
-        .miss_late = tally->miss_late,
-        .miss_skipped = tally->miss_skipped,
-        .overrun = tally->overrun,
+        .timing = timing_of(self),
         .crc_errors = faults.crc_errors,
         .seq_errors = faults.seq_errors,
         .stale_inputs = self->stale_jobs,
@@ -255,7 +284,7 @@ static est_cycle_status run(est_cycle *self, rt_job *job, int64_t now_ns) {
     estimator_finish(&self->estimator);
     status = status == EST_CYCLE_OK ? published : status;
     if (status == EST_CYCLE_OK) {
-        status = publish_timing(self, job, stale);
+        status = publish_timing(self, job, stale, now_ns);
     }
     if (status == EST_CYCLE_OK) {
         status = housekeeping(self, job);

@@ -3,11 +3,11 @@
  *     frames → est_bus (E2E, decode) → estimator → est_bus (encode, E2E) → frames
  *
  * Frames leave in this order: Estimate, EstimateInnov, EstValidity, EstWinding, EstRotor, then (response time known)
- * EstTimingA, EstTimingB, then housekeeping: once a second of release time the seven counter frames, with the first job and
- * every ten seconds the three identity frames behind them. Housekeeping is a queue of which a job sends at most four frames,
+ * EstTimingA … EstTimingD, then housekeeping: once a second of release time the sixteen counter frames, with the first job and
+ * every ten seconds the three identity frames behind them. Housekeeping is a queue of which a job sends at most two frames,
  * so that no more than eleven leave together (EST_CYCLE_FRAMES_PER_JOB), what the send queue of a CAN interface (10) and its
  * controller (1) take. The counters of one round are all from the moment it began; the next round waits for its end, so
- * with fewer than two jobs a second they come less often.
+ * with fewer than ten jobs a second they come less often.
  * No allocation, no lock, no printing. One thread; the caller owns the object. */
 #ifndef EST_CYCLE_H
 #define EST_CYCLE_H
@@ -23,8 +23,8 @@
 enum { EST_CYCLE_MAX_FRAMES = 4096 }; /* frames one job reads at most; the rest waits for the next job */
 
 enum {
-    EST_CYCLE_JOB_FRAMES = 7,          /* that every job sends */
-    EST_CYCLE_HOUSEKEEPING_FRAMES = 4, /* at most, beside them */
+    EST_CYCLE_JOB_FRAMES = 5 + TIMING_JOB_FRAMES, /* that every job sends */
+    EST_CYCLE_HOUSEKEEPING_FRAMES = 2,            /* at most, beside them */
     EST_CYCLE_FRAMES_PER_JOB = EST_CYCLE_JOB_FRAMES + EST_CYCLE_HOUSEKEEPING_FRAMES
 };
 

@@ -111,7 +111,7 @@ GOLDEN: list[tuple[str, dict[str, float], str]] = [
         },
         "ff21ff3f00c055aa",
     ),
-    ("EstOverload", {"queued": 16383.0, "cut": 32767.0, "rebased": 49151.0}, "a501ff3fff7fffbf"),
+    ("EstOverload", {"waiting": 9.0, "queued": 16383.0, "cut": 32767.0, "rebased": 49151.0}, "8491ff3fff7fffbf"),
     ("EstMissRun", {"consec_miss_max": 16383.0, "mk_worst": 85.0, "phase_us": 11184810.0}, "f201ff3f55aaaaaa"),
     ("EstOutputs", {"held": 16383.0, "predicted": 32767.0, "invalidated": 49151.0}, "e501ff3fff7fffbf"),
     (

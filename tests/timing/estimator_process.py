@@ -36,9 +36,10 @@ MS = 1_000_000
 TICK_NS = 10 * MS
 LAP_TICKS = 72_000
 CONTENT = ("Estimate", "EstimateInnov", "EstValidity", "EstWinding", "EstRotor")  # what carries no timing
-PER_JOB = (*CONTENT, "EstTimingA", "EstTimingB")
+PER_JOB = (*CONTENT, "EstTimingA", "EstTimingB", "EstTimingC", "EstTimingD")
 COUNTERS = ("EstReleases", "EstMisses", "EstInputFaults", "EstBusFaults", "EstCoreFaults", "EstCoreFaults2",
-            "EstCalibration")  # fmt: skip
+            "EstCalibration", "EstOverload", "EstMissRun", "EstOutputs", "EstEnvironment", "EstMachine", "EstCanary",
+            "EstWakeStat", "EstExecStat", "EstRespStat")  # fmt: skip
 IDENTITY = ("EstIdentity", "EstBuild", "EstGranted")
 
 

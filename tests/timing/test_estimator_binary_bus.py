@@ -55,17 +55,17 @@ def check_conservation(run) -> None:
     jobs = list(per_job(run))
     assert len(jobs) == final["estimates_sent"]
     assert {f.e2e for f in run.frames} == {E2eStatus.OK}
-    indices = [a.values["release_index"] for *_, a, _ in jobs]
+    indices = [a.values["release_index"] for *_, a, _, _, _ in jobs]
     assert indices == sorted(set(indices))
     assert indices[0] == 1
     skipped = 0
-    for before, (*_, timing, _) in zip([0, *indices], jobs, strict=False):
+    for before, (*_, timing, _, _, _) in zip([0, *indices], jobs, strict=False):
         gap = timing.values["release_index"] - before - 1
         assert timing.values["after_skip"] == (gap > 0)
         skipped += gap
     assert final["miss_skipped"] - skipped in (0, final["releases"] - indices[-1])
-    assert sum(a.values["miss_late"] for *_, a, _ in jobs) == final["miss_late"]
-    assert sum(a.values["stale_input"] for *_, a, _ in jobs) == final["stale_inputs"]
+    assert sum(a.values["miss_late"] for *_, a, _, _, _ in jobs) == final["miss_late"]
+    assert sum(a.values["stale_input"] for *_, a, _, _, _ in jobs) == final["stale_inputs"]
     last = {name: run.named(name)[-1].values for name in COUNTERS}
     assert last["EstReleases"]["releases"] == final["releases"]
     assert last["EstReleases"]["jobs"] == final["jobs"]

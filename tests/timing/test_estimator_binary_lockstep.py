@@ -57,7 +57,7 @@ def check_validity_frames(said):
 def housekeeping(period_ms: int, seconds: int) -> list[tuple[int, str]]:
     """When (ms) which frame must leave: rounds of counters (each second) and identity (at start, each ten seconds).
 
-    Four frames a job, a round at a time; and the counters once more at the end.
+    Two frames a job, a round at a time; and the counters once more at the end.
     """
     out, queue, counters_due, identity_due = [], [], 1000, 0
     for t in range(period_ms, seconds * 1000 + 1, period_ms):
@@ -66,17 +66,18 @@ def housekeeping(period_ms: int, seconds: int) -> list[tuple[int, str]]:
                 queue, counters_due = list(COUNTERS), t - t % 1000 + 1000
             if t >= identity_due:
                 queue, identity_due = [*queue, *IDENTITY], t - t % 10_000 + 10_000
-        out += [(t, name) for name in queue[:4]]
-        queue = queue[4:]
+        out += [(t, name) for name in queue[:2]]
+        queue = queue[2:]
     return out + [(seconds * 1000, name) for name in COUNTERS]
 
 
 def test_housekeeping_of_the_usual_period_is_what_the_documents_say():
     times = housekeeping(100, 12)
     assert [t for t, name in times if name == "EstReleases"] == [*range(1000, 12_001, 1000), 12_000]
-    assert [t for t, name in times if name == "EstCalibration"] == [*range(1100, 12_000, 1000), 12_000]
-    assert [t for t, name in times if name == "EstIdentity"] == [100, 10_100]
-    assert [t for t, name in times if name == "EstGranted"] == [100, 10_200]
+    assert [t for t, name in times if name == "EstCalibration"] == [*range(1300, 12_000, 1000), 12_000]
+    assert [t for t, name in times if name == "EstRespStat"] == [*range(1700, 12_000, 1000), 12_000]
+    assert [t for t, name in times if name == "EstIdentity"] == [100, 10_800]
+    assert [t for t, name in times if name == "EstGranted"] == [200, 10_900]
 
 
 @pytest.mark.parametrize("period_ms", [100, 1, 10, 250, 1000])
@@ -95,11 +96,16 @@ def test_one_estimate_per_job_and_everything_accounted_for(program, period_ms):
     assert {f.e2e for f in run.frames} == {E2eStatus.OK}, "a gap in a counter"
     assert run.controls == [*((t * TICK_NS, TICK) for t in range(seconds * 100 + 1)), (seconds * 1000 * MS, END)]
     for n, job in enumerate(jobs, start=1):
-        *contents, timing_a, timing_b = job
+        *contents, timing_a, timing_b, timing_c, timing_d = job
         assert timing_a.values["release_index"] == n
         assert timing_a.values["wake_lat_us"] is None, "nothing sleeps in lock-step"
         assert timing_a.values["warmup"] == (n <= warmup)
         assert timing_b.values["resp_us"] >= timing_b.values["exec_wall_us"] > 0
+        assert {k: timing_c.values[k] for k in ("output", "cut", "queued")} == {"output": 0, "cut": 0, "queued": 0}
+        assert timing_c.values["in_age_motor_us"] == n * period_ms % 10 * 1000, "age in record time"
+        assert timing_c.values["in_age_temp_us"] == n * period_ms % 100 * 1000
+        assert timing_d.values["exec_cpu_us"] > 0
+        assert timing_d.values["canary_us"] is None
         assert {f.t_ns for f in job} == {n * period_ms * MS}
         # Releases run at TICK, when everything before has been delivered: the newest tick is the one in use.
         assert {f.values["tick"] for f in contents} == {n * period_ms // 10}
@@ -112,6 +118,10 @@ def test_one_estimate_per_job_and_everything_accounted_for(program, period_ms):
     assert jobs[-1][0].values["status"] == OK
     check_validity_frames([job[2].values for job in jobs])
     assert run.named("EstReleases")[-1].values["jobs"] == len(jobs)
+    for name, metric in (("EstRespStat", "resp_us"), ("EstExecStat", "exec_wall_us"), ("EstWakeStat", "wake_lat_us")):
+        shown = run.named(name)[-1].values
+        for signal, key in (("p99_us", "p99"), ("max_us", "max")):
+            assert shown[signal] == pytest.approx(run.final[metric][key], abs=0.0501), (name, signal)
 
 
 def test_the_estimate_follows_the_measurement(release):
@@ -270,8 +280,8 @@ def test_silent_plant_makes_stale_inputs_and_is_seen_on_the_bus(program):
     records = [r for r in drive(range(1201)) if not (r.can_id == 0x0A0 and r.t_ns // TICK_NS in silent)]
     run = run_drive(program, records)
     assert run.status == 0
-    stale = [a.values["release_index"] for *_, a, _ in per_job(run) if a.values["stale_input"]]
-    for estimate, *_, timing_a, timing_b in per_job(run):
+    stale = [a.values["release_index"] for *_, a, _, _, _ in per_job(run) if a.values["stale_input"]]
+    for estimate, *_, timing_a, timing_b, _, _ in per_job(run):
         if timing_a.values["stale_input"]:
             assert timing_b.values["miss_cause"] == STALE_CAUSE
         if 61 <= timing_a.values["release_index"] <= 79:
@@ -321,7 +331,7 @@ def test_coolant_frames_are_checked_and_their_absence_makes_nothing_stale(progra
     assert (coolant["ok"], coolant["lost"], coolant["wrong_crc"], coolant["timeouts"]) == (3, 1, 1, 1)
     assert (run.final["crc_errors"], run.final["seq_errors"], run.final["foreign"]) == (1, 1, 0)
     assert run.final["stale_inputs"] == 0
-    assert not any(a.values["stale_input"] for *_, a, _ in per_job(run))
+    assert not any(a.values["stale_input"] for *_, a, _, _, _ in per_job(run))
     calibration = run.named("EstCalibration")[-1].values
     assert calibration["offset_w_degc"] == calibration["offset_r_degc"] == pytest.approx(-1.0)
 
@@ -337,7 +347,7 @@ def test_a_plant_that_sends_but_stands_still_is_stale(program):
         records.append(tick_record(tick * TICK_NS))
     run = run_drive(program, records)
     assert (run.status, run.final["seq_errors"]) == (0, 0)
-    for estimate, *_, timing_a, _ in per_job(run):
+    for estimate, *_, timing_a, _, _, _ in per_job(run):
         n = timing_a.values["release_index"]
         if n > 20:
             assert timing_a.values["stale_input"] == (61 <= n <= 80), n  # 80 works off the intervals without a frame

@@ -76,9 +76,11 @@ CONTRACT = {
         "calibration_state": (12, 4, False, 1, 0, False), "offset_w_degc": (16, *S16, 1 / 256, 0, True),
         "offset_r_degc": (32, *S16, 1 / 256, 0, True), "offset_sigma_w_degc": (48, 8, False, 0.005, 0, True),
         "offset_sigma_r_degc": (56, 8, False, 0.005, 0, True)}),
+    "EstOverload": (0x4A7, "ESTIMATOR", 1000, {
+        "waiting": (12, 4, False, 1, 0, False),
+        **{n: (s, *U16, 1, 0, False) for n, s in (("queued", 16), ("cut", 32), ("rebased", 48))}}),
     **{name: (can_id, "ESTIMATOR", 1000, {n: (s, *U16, 1, 0, False) for n, s in zip(names, (16, 32, 48), strict=True)})
-       for name, can_id, names in (("EstOverload", 0x4A7, ("queued", "cut", "rebased")),
-                                   ("EstOutputs", 0x4A9, ("held", "predicted", "invalidated")),
+       for name, can_id, names in (("EstOutputs", 0x4A9, ("held", "predicted", "invalidated")),
                                    ("EstEnvironment", 0x4AA, ("minor_faults", "major_faults", "invol_switches")))},
     "EstMissRun": (0x4A8, "ESTIMATOR", 1000, {
         "consec_miss_max": (16, *U16, 1, 0, False), "mk_worst": (32, 8, False, 1, 0, False),
@@ -156,6 +158,24 @@ def test_every_setting_of_the_estimator_has_its_label():
     labels = next(s.labels for s in load_dbc()["EstBuild"].signals if s.name == "setting_id")
     settings = {tomllib.loads(p.read_text())["id"]: p.stem for p in SETTINGS.glob("*.toml")}
     assert {code: label for code, label in labels.items() if label != "not_available"} == settings
+
+
+TIMING = (*(f"Timing{x}" for x in "ABCD"), "Releases", "Misses", "Overload", "MissRun", "Outputs", "Environment",
+          "Machine", "Canary", "WakeStat", "ExecStat", "RespStat")  # fmt: skip
+
+
+def test_every_process_has_the_timing_frames_in_one_layout():
+    """One encoder in C packs them for all: only ids, data ids and the names of a process's inputs differ."""
+    dbc = load_dbc()
+
+    def layout(name: str) -> list[tuple]:
+        return [(s.start, s.length, s.is_signed, s.factor, s.offset, s.raw_na) for s in dbc[name].signals]
+
+    prefixes = {m.name.removesuffix("TimingA") for m in dbc if m.name.endswith("TimingA")}
+    assert "Est" in prefixes
+    for prefix in prefixes:
+        for name in TIMING:
+            assert layout(prefix + name) == layout("Est" + name), prefix + name
 
 
 def test_not_available_is_all_ones_or_most_negative_and_never_a_valid_code():
