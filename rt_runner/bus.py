@@ -80,6 +80,8 @@ def can_trouble() -> str | None:
 def choose_bus(wanted: str = "auto") -> BusChoice:
     """Choose the bus: ``auto`` (vcan0 if it is there and up, else the hub), ``hub``, or an interface by name.
 
+    ``rt_hub:PATH`` is a hub that runs already, somebody else's: it is used and left as it is.
+
     Raises
     ------
     SetupError
@@ -89,8 +91,11 @@ def choose_bus(wanted: str = "auto") -> BusChoice:
     """
     if wanted == "hub":
         return BusChoice("rt_hub", "", "asked for")
+    kind, _, path = wanted.partition(":")
+    if kind == "rt_hub" and path:
+        return BusChoice("rt_hub", path, "asked for")
     name = "vcan0" if wanted == "auto" else wanted
-    if not 0 < len(os.fsencode(name)) < _IFNAMSIZ or "/" in name or any(c.isspace() for c in name):
+    if not 0 < len(os.fsencode(name)) < _IFNAMSIZ or any(c in "/:" or c.isspace() for c in name):
         raise UsageError(f"--bus {wanted!r}: not a bus; give auto, hub, or a CAN interface such as vcan0")
     interface = look_up(name)
     if not interface.exists:

@@ -12,7 +12,10 @@ def add_parser(verbs) -> None:
     )
     add_scenario_options(p, "hot-lap")
     p.add_argument(
-        "--bus", default="auto", metavar="auto|vcan0|can0|hub", help="default: vcan0 if it exists, else the hub"
+        "--bus",
+        default="auto",
+        metavar="auto|vcan0|can0|hub",
+        help="default: vcan0 if it exists, else the hub; rt_hub:PATH is a hub that runs already",
     )
     p.add_argument("--core", type=int, help="core of the estimator (default: the last one)")
     p.add_argument("--no-rt", action="store_true", help="do not ask for SCHED_FIFO and locked memory")

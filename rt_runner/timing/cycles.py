@@ -14,7 +14,7 @@ from cantools.database.can import Database, Message
 NS_PER_MS = 1_000_000
 TIMEOUT_CYCLES = 3  # where the DBC does not say how long a receiver waits
 END_GRACE_S = 1.0  # a run is not ended at one moment: its nodes may stop so long before its log does
-TRIM_FROM = 5  # from so many periods on the shortest and the longest are left out of the typical one
+TRIM_FROM = 5  # from so many periods on the typical one is their mean without the shortest and the longest
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,12 @@ class Expected:
 class CycleRow:
     """One message over one log. Times between neighbouring frames in ms, None where there are too few frames.
 
-    ``typical_ms`` is the mean without the shortest and the longest period (five periods or more): last words at the end
-    of a run and one interruption do not change a rate. ``longest_ms`` counts the silences at both ends, too: from its
-    node's first frame on, and up to its node's last one, or the log's end less a second. ``longest_from_ns`` is the
-    stamp it began at. ``missing`` is how many cycles passed without a frame, ``timeouts`` how often it was silent for
-    longer than ``timeout_ms``; one that never came although its node spoke long enough is one timeout.
+    ``typical_ms`` is the mean without the shortest and the longest period, of fewer than five periods the longest: last
+    words at the end of a run and one interruption do not change a rate. ``longest_ms`` counts the silences at both
+    ends, too: from its node's first frame on, and up to its node's last one, or the log's end less a second.
+    ``longest_from_ns`` is the stamp it began at. ``missing`` is how many cycles passed without a frame, ``timeouts``
+    how often it was silent for longer than ``timeout_ms``; a message that never came although its node spoke for long
+    enough timed out once.
     """
 
     name: str
@@ -126,7 +127,7 @@ class CycleCheck:
         self._last_ns: int | None = None
 
     def add(self, t_ns: int, frame_id: int, extended: bool = False) -> None:
-        """One frame, received at ``t_ns``; about 0.5 us."""
+        """One frame, received at ``t_ns``; 1 to 2 us."""
         if self._last_ns is None:
             self._first_ns = self._last_ns = t_ns
         elif t_ns > self._last_ns:
@@ -215,8 +216,8 @@ class _Meter:
                     longest_ns, from_ns = silent_ns, start_ns
         e, periods = self.expected, self.frames - 1
         mean_ns = (self.last_ns - self.first_ns) / periods if periods > 0 else None
-        typical_ns = mean_ns
-        if mean_ns is not None and periods >= TRIM_FROM:
+        typical_ns = self.max_ns if periods > 0 else None
+        if periods >= TRIM_FROM:
             typical_ns = (self.last_ns - self.first_ns - self.min_ns - self.max_ns) / (periods - 2)
         return CycleRow(
             name=e.name,

@@ -42,7 +42,7 @@ def test_figures_are_those_of_the_periods(periods_us):
     assert row.mean_ms == pytest.approx(statistics.fmean(ms))
     assert row.std_ms == pytest.approx(statistics.stdev(ms), abs=1e-6)
     assert (row.min_ms, row.max_ms, row.longest_ms) == (min(ms), max(ms), max(ms))
-    kept = sorted(ms)[1:-1] if len(ms) >= 5 else ms
+    kept = sorted(ms)[1:-1] if len(ms) >= 5 else [max(ms)]
     assert row.typical_ms == pytest.approx(statistics.fmean(kept))
     assert row.timeouts == sum(p > 30 for p in ms)
     assert row.missing == sum((2 * round(p * MS) + 10 * MS) // (20 * MS) - 1 for p in ms if p > 15)
@@ -66,6 +66,12 @@ def test_a_rate_that_is_off_is_not_ok():
 def test_last_words_and_one_interruption_do_not_change_a_rate():
     row = row_of([*grid(0, 200, 10), 191 * MS, 391 * MS, 401 * MS])
     assert row.rate_ok(0.001)
+
+
+def test_of_few_periods_the_longest_is_judged():
+    last_words = row_of([*grid(0, 30, 10), 21 * MS])
+    assert (last_words.typical_ms, last_words.rate_ok(0.01)) == (10.0, True)
+    assert row_of([0, 10 * MS, 22 * MS]).rate_ok(0.05) is False
 
 
 def test_who_stops_before_its_node_or_the_log_does_is_timed_out():
