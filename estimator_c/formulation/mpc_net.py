@@ -27,9 +27,7 @@ from .weights import NetWeights, load_weights
 PORTABLE = Isa("portable", 1)
 
 
-def generate_mpc(
-    weights_path: Path, settings_folder: Path, out: Path, isas: Sequence[Isa] = ISAS
-) -> list[Path]:
+def generate_mpc(weights_path: Path, settings_folder: Path, out: Path, isas: Sequence[Isa] = ISAS) -> list[Path]:
     """Write all generated files into `out` and return their paths; unchanged files keep their time stamp."""
     weights = load_weights(weights_path)
     vehicle, settings = load_vehicle(settings_folder), load_mpc_settings(settings_folder)

@@ -167,7 +167,8 @@ def settings_header(banner: str, count: int) -> str:
     """mpc_settings.h."""
 
     def members(numbers: tuple[Number, ...]) -> str:
-        return "\n".join(f"    {'int32_t' if n.whole else 'double'} {n.key + ';':<24} /* {n.meaning} */" for n in numbers)
+        types = {True: "int32_t", False: "double"}
+        return "\n".join(f"    {types[n.whole]} {n.key + ';':<24} /* {n.meaning} */" for n in numbers)
 
     modes = ", ".join(f"MPC_MODE_{mode.upper()} = {k}" for k, mode in enumerate(MODES))
     return f"""{banner}#ifndef MPC_SETTINGS_H
