@@ -17,8 +17,6 @@ static const double UPPER_SIGMA = 3.0;
 static const double MODEL_VARIANCE = 0.01; /* K^2: a plant that is not quite the one the net knows, see docs/estimator.md */
 static const double START_VARIANCE = 0.09; /* the same while the net's memory is still filling */
 static const int32_t START_STEPS = 200;
-static const double MARGIN_DEGC_S = 0.05; /* of the upper bound, without a trusted sensor */
-static const double MARGIN_MAX_DEGC = 10.0;
 
 /* Larger magnitudes are no temperature in degC, torque in Nm or speed in rpm but a broken sender; they would wear off
  * only after a hundred thousand windows. */
@@ -252,11 +250,6 @@ static void reopen(estimator_t *self)
     self->started = false;
 }
 
-static bool in_range(const estimator_t *self, double raw)
-{
-    return raw >= self->setting.range_low_degc && raw <= self->setting.range_high_degc;
-}
-
 void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc, double theta_r_degc, bool w_valid,
                          bool r_valid)
 {
@@ -264,8 +257,8 @@ void estimator_feed_temp(estimator_t *self, uint16_t tick16, double theta_w_degc
     const double y[MHE_CHANNELS] = {theta_w_degc - offset[0], theta_r_degc - offset[1]};
     bool valid[MHE_CHANNELS] = {w_valid && usable(theta_w_degc), r_valid && usable(theta_r_degc)};
     if (!self->started && self->setting.supervise) { /* an open or shorted sensor is no temperature to start from */
-        valid[0] = valid[0] && in_range(self, theta_w_degc);
-        valid[1] = valid[1] && in_range(self, theta_r_degc);
+        valid[0] = valid[0] && sensor_monitor_in_range(&self->fusion.monitor[0], theta_w_degc);
+        valid[1] = valid[1] && sensor_monitor_in_range(&self->fusion.monitor[1], theta_r_degc);
     }
     int64_t tick = self->motor_seen ? unwrap(self->newest_tick, tick16)
                    : self->anchored ? unwrap(self->newest_temp_tick, tick16)
@@ -501,11 +494,6 @@ static void publish_theta(const estimator_t *self, estimator_out_t *out)
     out->theta_r_degc = theta[1];
 }
 
-static double distrusted_s(const sensor_monitor_t *monitor)
-{
-    return monitor->trusted ? 0.0 : NET_DT_S * monitor->distrusted_steps;
-}
-
 /* What is said of a channel beside its estimate. The bound grows from the moment its sensor is distrusted. */
 static estimator_channel_t channel_now(const estimator_t *self, int ch, double theta_degc)
 {
@@ -513,12 +501,12 @@ static estimator_channel_t channel_now(const estimator_t *self, int ch, double t
     const double sigma = sqrt(self->variance[ch]);
     const double offset_sigma = self->calibration.result.sigma_degc[ch];
     const double model = self->fusion.steps < START_STEPS ? START_VARIANCE : MODEL_VARIANCE;
-    const double margin = fmin(MARGIN_MAX_DEGC, MARGIN_DEGC_S * distrusted_s(monitor));
     return (estimator_channel_t){
         .fault = monitor->fault,
         .trusted = monitor->trusted && self->fusion.share[ch] > 0.0,
         .sigma_degc = sigma,
-        .upper_degc = theta_degc + UPPER_SIGMA * sqrt(self->variance[ch] + model + offset_sigma * offset_sigma) + margin,
+        .upper_degc = theta_degc + UPPER_SIGMA * sqrt(self->variance[ch] + model + offset_sigma * offset_sigma) +
+                      sensor_monitor_gained_degc(monitor),
         .innov_sigma_degc = isnan(self->innovation[ch]) ? NAN : sqrt(self->innovation_variance[ch]),
     };
 }
@@ -538,7 +526,7 @@ static estimator_status_t status_now(const estimator_t *self)
         const sensor_monitor_t *monitor = &self->fusion.monitor[ch];
         const double age_s = ESTIMATOR_TICK_S * (double)(self->newest_tick - self->last_measured_tick[ch]);
         distrusted = distrusted || age_s > self->setting.sensor_timeout_s || !monitor->trusted;
-        open_loop = open_loop || distrusted_s(monitor) > self->setting.open_loop_s;
+        open_loop = open_loop || sensor_monitor_distrusted_s(monitor) > self->setting.open_loop_s;
     }
     if (self->fusion.fallback) {
         return ESTIMATOR_FALLBACK;
