@@ -68,14 +68,15 @@ void fusion_doubt(fusion_t *self, double novelty);
  * channel. Returns the innovation (NAN: none) and its predicted variance. */
 double fusion_measure(fusion_t *self, int channel, double y, double raw, double *variance);
 
-/* A value for a node `age` > 0 steps back, later than the next value. It enters the MHE's window if the monitor would have let it,
- * not the filter. Returns the innovation; NAN: too late, or no MHE. */
+/* A value for a node `age` > 0 steps back, later than the next value. It enters the MHE's window if the monitor would have
+ * let it, not the filter. Returns the innovation; NAN: too late, or no MHE. */
 double fusion_measure_late(fusion_t *self, int age, int channel, double y, double raw);
 
 /* Solve and give the estimate at the newest node; in mode feedback, after one sweep. */
 void fusion_solve(fusion_t *self, fusion_estimate_t *estimate);
 
-/* Mode feedback: the rest of the solution, which the next step begins from. Returns its status; MHE_OK where nothing is left. */
+/* Mode feedback: the rest of the solution, which the next step begins from. Returns its status; MHE_OK where nothing is
+ * left. */
 mhe_status_t fusion_finish(fusion_t *self);
 
 #endif
