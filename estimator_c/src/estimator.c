@@ -72,9 +72,9 @@ estimator_error_t estimator_init(estimator_t *self, const est_setting_t *setting
     return ESTIMATOR_OK;
 }
 
-/* A channel without any measurement starts at the other's temperature. Held firmly there while nothing else speaks for it
- * (a problem with nothing to hold it converges slowly); but this prior says little, so that from the first measurement on,
- * until a window is full of them, it weighs next to nothing. */
+/* A channel without any measurement starts at the other's temperature. Held firmly there while nothing else speaks for
+ * it (a problem with nothing to hold it converges slowly); but this prior says little, so that from the first
+ * measurement on, until a window is full of them, it weighs next to nothing. */
 static void fall_back(estimator_t *self, int ch)
 {
     self->fallback_left[ch] = MHE_NODES;
@@ -237,8 +237,9 @@ static void consume_interval(estimator_t *self, estimator_out_t *out)
     self->next_interval = k + 1;
     out->intervals++;
     if (self->started) {
-        validity_step(&self->validity, self->input[estimator_slot(k)], self->theta); /* as the net is fed for interval k */
-        self->novelty[estimator_slot(k)] = self->validity.result.novelty;
+        const size_t slot = estimator_slot(k);
+        validity_step(&self->validity, self->input[slot], self->theta); /* as the net is fed for interval k */
+        self->novelty[slot] = self->validity.result.novelty;
     }
 
     const int64_t node = k + 1 - self->setting.delay_steps;

@@ -3,7 +3,7 @@
 
 #include "estimator_parts.h"
 
-static const int32_t OFF_GRID_LIMIT = 3; /* that many temperature frames off the grid in a row: the plant moved its grid */
+static const int32_t OFF_GRID_LIMIT = 3; /* temperature frames off the grid in a row: the plant moved its grid */
 static const double MOVING_RPM = 50.0, MOVING_NM = 5.0;
 
 /* Larger magnitudes are no temperature in degC, torque in Nm or speed in rpm but a broken sender; they would wear off
@@ -136,7 +136,8 @@ static void forget_early(estimator_t *self)
     memset(self->early_count, 0, sizeof self->early_count);
 }
 
-/* The offset has changed, at a standstill: the window opens anew with the next measurement, nothing from before counts. */
+/* The offset has changed, at a standstill: the window opens anew with the next measurement, nothing from before
+ * counts. */
 static void reopen(estimator_t *self)
 {
     fusion_init(&self->fusion, &self->setting);

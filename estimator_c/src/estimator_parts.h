@@ -1,5 +1,5 @@
-/* What estimator.c (start, steps), estimator_feed.c (frames in) and estimator_publish.c (what is said) share; for these three
- * alone. Nothing here fails; cost as said, threads and memory as in estimator.h. */
+/* What estimator.c (start, steps), estimator_feed.c (frames in) and estimator_publish.c (what is said) share; for
+ * these three alone. Nothing here fails; cost as said, threads and memory as in estimator.h. */
 #ifndef ESTIMATOR_PARTS_H
 #define ESTIMATOR_PARTS_H
 
@@ -13,8 +13,8 @@ static inline size_t estimator_slot(int64_t k)
     return (size_t)(k & (ESTIMATOR_RING - 1));
 }
 
-/* Begin again, all but the setting, the counters and the sensors' offset unknown; the same plant: what is known of a sensor
- * that is not believed stays known, too. < 10 us. */
+/* Begin again, all but the setting, the counters and the sensors' offset unknown; the same plant: what is known of a
+ * sensor that is not believed stays known, too. < 10 us. */
 void estimator_restart(estimator_t *self, bool same_plant);
 
 /* No node has a measurement. < 1 us. */

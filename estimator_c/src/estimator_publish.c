@@ -3,7 +3,7 @@
 #include "estimator_parts.h"
 
 static const double UPPER_SIGMA = 3.0;
-static const double MODEL_VARIANCE = 0.01; /* K^2: a plant that is not quite the one the net knows, see docs/estimator.md */
+static const double MODEL_VARIANCE = 0.01; /* K^2: a plant not quite the one the net knows, see docs/estimator.md */
 static const double START_VARIANCE = 0.09; /* the same while the net's memory is still filling */
 static const int32_t START_STEPS = 200;
 

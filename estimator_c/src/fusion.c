@@ -3,7 +3,7 @@
 #include <math.h>
 #include <string.h>
 
-static const int32_t MEMORY_STEPS = 200;      /* 20 s: until then the filter still learns what the net should remember */
+static const int32_t MEMORY_STEPS = 200;      /* 20 s: so long the filter learns what the net should remember */
 static const double USABLE_KKT_DEGC = 0.01;   /* an MHE cut short is still used below this ... */
 static const double FEEDBACK_KKT_DEGC = 1.0;  /* ... and one sweep may leave that to the next step */
 static const double CREEP_VARIANCE = 0.25;    /* K^2, of the slow observer's level */
@@ -41,8 +41,8 @@ static bool uses_mhe(const fusion_t *self)
     return self->setting.kind == EST_KIND_MHE;
 }
 
-/* A rate that is wrong by m for a time tau (LACK_S) moves the temperature as noise of variance 2 tau m^2 dt per step would.
- * What the slow observer has learned to be wrong is taken for m as far as it is more than LACK_USUAL. */
+/* A rate that is wrong by m for a time tau (LACK_S) moves the temperature as noise of variance 2 tau m^2 dt per step
+ * would. What the slow observer has learned to be wrong is taken for m as far as it is more than LACK_USUAL. */
 static void set_noise(fusion_t *self)
 {
     for (int ch = 0; ch < MHE_CHANNELS && self->setting.supervise; ch++) {
@@ -51,8 +51,8 @@ static void set_noise(fusion_t *self)
     }
 }
 
-/* Arrival cost: the filter's prediction of the oldest node says what all measurements before the window say. With it the
- * MHE begins where the filter stood, and no measurement counts twice. */
+/* Arrival cost: the filter's prediction of the oldest node says what all measurements before the window say. With it
+ * the MHE begins where the filter stood, and no measurement counts twice. */
 static void begin_at_oldest(fusion_t *self)
 {
     if (!uses_mhe(self) || self->setting.arrival_from != EST_ARRIVAL_FROM_FILTER || !self->mhe.full) {
@@ -91,8 +91,8 @@ void fusion_advance(fusion_t *self, const double u[2])
     slow_observer_predict(&self->slow, u);
 }
 
-/* Hand the noise to the MHE, and the loss's scale: it bends where values are out of the ordinary, and with a noisy sensor
- * the ordinary is wider. */
+/* Hand the noise to the MHE, and the loss's scale: it bends where values are out of the ordinary, and with a noisy
+ * sensor the ordinary is wider. */
 static void weigh(fusion_t *self)
 {
     double noise[MHE_CHANNELS];

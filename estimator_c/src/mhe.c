@@ -119,7 +119,8 @@ void mhe_advance(mhe_t *self, const real_t u[2])
     }
 }
 
-void mhe_arrival(mhe_t *self, const real_t prior[MHE_CHANNELS], const real_t weight[MHE_CHANNELS], const real_t memory[])
+void mhe_arrival(mhe_t *self, const real_t prior[MHE_CHANNELS], const real_t weight[MHE_CHANNELS],
+                 const real_t memory[])
 {
     memcpy(self->prior, prior, sizeof self->prior);
     memcpy(self->weight_arrival, weight, sizeof self->weight_arrival);
@@ -180,9 +181,9 @@ typedef struct {
     real_pair_t curvature[MHE_NODES]; /* in the matrix */
 } losses_t;
 
-/* Huber 1965, Geman and McClure 1987. The curvature: with `careful` the same as the pull, a parabola above the loss that
- * touches it, so that no step can climb; else the loss's own curvature, which ends in fewer sweeps, where that is not
- * negative. All nodes of the ring, in use or not: a loop of known length is computed two numbers at a time. */
+/* Huber 1965, Geman and McClure 1987. The curvature: with `careful` the same as the pull, a parabola above the loss
+ * that touches it, so that no step can climb; else the loss's own curvature, which ends in fewer sweeps, where that is
+ * not negative. All nodes of the ring, in use or not: a loop of known length is computed two numbers at a time. */
 static void weigh(const mhe_t *self, bool careful, losses_t *out)
 {
     const real_t per_scale = 1 / self->loss_scale;
@@ -267,8 +268,8 @@ static void adjoint_sweep(mhe_t *self, const losses_t *losses)
     }
 }
 
-/* Gauss-Newton matrix of each channel with the direct slope of each stage; constant within a step unless the loss weighs
- * the residuals anew. */
+/* Gauss-Newton matrix of each channel with the direct slope of each stage; constant within a step unless the loss
+ * weighs the residuals anew. */
 static void factor(mhe_t *self, const losses_t *losses)
 {
     const real_t *p0 = arrival_weight(self);
@@ -365,7 +366,7 @@ static void sweep(mhe_t *self, mhe_result_t *result)
             at(self, k)->theta[ch] += step[k][ch];
         }
     }
-    self->stale = !self->converged; /* the last step, within the tolerance, makes the estimate better but moves no stage */
+    self->stale = !self->converged; /* the last step, within the tolerance, betters the estimate but moves no stage */
 }
 
 /* Close the books of a solve: the estimate, and whether all of it is finite. */

@@ -25,7 +25,7 @@ static const double BESIDE_USUAL = 4.0;        /* ... and that much of what is u
 /* Steps. */
 static const int32_t REBASE = 20;              /* values that give the size of a step */
 static const double REBASED_SHARE = 0.005;     /* of a value's weight afterwards: followed over ten seconds */
-static const int32_t REBASE_HOLD = 1200;       /* steps, 2 min: later the net alone knows better than a step measured then */
+static const int32_t REBASE_HOLD = 1200;       /* steps, 2 min: then the net alone knows better than that measurement */
 
 /* What creeps: lag and drift. */
 static const double SLOW_MEMORY = 1.0 / 150.0; /* 15 s */
@@ -33,7 +33,7 @@ static const double SLOW_LAG_S = 1.5;          /* slope of the slow innovation o
 static const double SLOW_EFFECT_DEGC = 0.5;    /* and what it must amount to */
 static const double SLOW_CORRELATION2 = 0.5;
 static const double DRIFT_USUAL = 1.45;        /* times what is usual */
-static const int32_t USUAL_BLOCK = 100;        /* 10 s; what is usual is MONITOR_PENDING blocks old: a drift shows meanwhile */
+static const int32_t USUAL_BLOCK = 100;        /* 10 s; the usual is MONITOR_PENDING blocks old: drift shows first */
 static const double USUAL_KEEP = 0.998;        /* per block: 80 min */
 static const int32_t WARM_UP = 600;            /* steps before drift is judged */
 static const int32_t RELAPSE = 600;            /* steps: distrusted again within a minute */
@@ -353,8 +353,8 @@ static monitor_verdict_t judge_stepped(sensor_monitor_t *self, const monitor_inp
     return (monitor_verdict_t){.share = self->run > 0 ? 0.0 : REBASED_SHARE, .offset = self->offset};
 }
 
-/* How far a sound sensor may stand from the prediction: what the filter says of itself, and what a plant that is not the net's
- * may have gained on the net meanwhile. A step or a creep must not slip in that way: they leave less room. */
+/* How far a sound sensor may stand from the prediction: what the filter says of itself, and what a plant that is not
+ * the net's may have gained on the net meanwhile. A step or a creep must not slip in that way: they leave less room. */
 static double plausible_level(const sensor_monitor_t *self, const monitor_input_t *in)
 {
     const double filter = PLAUSIBLE_DEGC + 3.0 * sqrt(fmin(in->variance, PLAUSIBLE_VARIANCE));

@@ -8,8 +8,8 @@
  *   slow innovation as such, against what is usual                  → drift
  *
  * A sensor that stepped away and scatters as it should still shows changes: its values count a little, less the step.
- * A distrusted sensor is believed again after some seconds in which its values agree with the prediction, within what the
- * prediction may have lost meanwhile, and scatter as they should. Two faults at once show as the graver one.
+ * A distrusted sensor is believed again after some seconds in which its values agree with the prediction, within what
+ * the prediction may have lost meanwhile, and scatter as they should. Two faults at once show as the graver one.
  *
  * No allocation, no clock, no printing; one thread at a time per object; < 1 kB. */
 #ifndef SENSOR_MONITOR_H
