@@ -70,8 +70,10 @@ def _head(summary: LogSummary) -> list[str]:
 
 
 def _tail(summary: LogSummary) -> list[str]:
-    silent = [m.name for m in summary.messages if not m.frames]
-    lines = [f"no frames of: {', '.join(silent)}"] if silent else []
+    absent = {m.sender for m in summary.messages} - {m.sender for m in summary.messages if m.frames}
+    silent = [m.name for m in summary.messages if not m.frames and m.sender not in absent]
+    lines = [f"not on the bus: {', '.join(sorted(absent))}"] if absent else []
+    lines += [f"no frames of: {', '.join(silent)}"] if silent else []
     if summary.unknown:
         unknown = ", ".join(f"{can_id} ({count})" for can_id, count in summary.unknown.items())
         lines.append(f"ids that are not in the DBC: {unknown}")

@@ -296,7 +296,7 @@ def test_bus_lost(hub, start):
 
 
 def test_disk_full(hub, start):
-    logger, sender = start(hub.bus, limit=80_000), hub.open()  # the contract, attached first, takes most of it
+    logger, sender = start(hub.bus, limit=150_000), hub.open()  # the contract, attached first, takes most of it
     plant = Encoder(DBC, "PLANT")
     error = None
     for i in range(200_000):

@@ -116,7 +116,52 @@ CONTRACT = {
         "period_us": (40, 24, False, 1, 0, True)}),
     "PlantIdentity": (0x7B0, "PLANT", 10000, {
         "params_hash": (16, 24, False, 1, 0, False), "scenario_hash": (40, 24, False, 1, 0, False)}),
+    "TorqueCommand": (0x0B0, "CONTROLLER", 100, {
+        "derating": (12, 1, False, 1, 0, False), "origin": (13, 2, False, 1, 0, False),
+        "clamped": (15, 1, False, 1, 0, False), "torque_acc_nm": (16, 11, False, 0.1, 0, True),
+        "torque_brk_nm": (27, 10, False, 0.1, 0, True), "torque_fric_nm": (37, 11, False, 0.25, 0, True),
+        "tick": (48, *U16, 1, 0, False)}),
+    "VehicleState": (0x1D0, "PLANT", 100, {
+        "v_mps": (12, 16, False, 0.001, 0, True), "distance_m": (28, 20, False, 0.1, 0, True),
+        "tick": (48, *U16, 1, 0, False)}),
+    "CtlState": (0x2B0, "CONTROLLER", 100, {
+        "solver_status": (12, 4, False, 1, 0, True), "theta_w_peak_degc": (16, *U16, 1 / 256, -50, True),
+        "theta_w_end_degc": (32, *U16, 1 / 256, -50, True), "tick": (48, *U16, 1, 0, False)}),
+    "CtlSolve": (0x2B1, "CONTROLLER", 100, {
+        "sweeps": (12, 4, False, 1, 0, False), "slack_degc": (16, *U16, 1 / 256, 0, True),
+        "margin_degc": (32, *U16, 1 / 256, 0, True), "tick": (48, *U16, 1, 0, False)}),
+    **{name: (can_id, "CONTROLLER", 1000, {
+        nibble: (12, 4, False, 1, 0, False),
+        **{n: (s, *U16, 1, 0, False) for n, s in zip(names, (16, 32, 48), strict=True)}})
+       for name, can_id, nibble, names in (
+           ("CtlFallbacks", 0x4B4, "mute", ("shifted", "by_rule", "clamped")),
+           ("CtlSolves", 0x4B5, "bad_inputs", ("failed", "unconverged", "no_estimate")))},
+    **{name: (can_id, "CONTROLLER", 1000, {n: (s, *U16, 1, 0, False) for n, s in zip(names, (16, 32, 48), strict=True)})
+       for name, can_id, names in (("CtlInputFaults", 0x4B2, ("crc_errors", "seq_errors", "stale_inputs")),
+                                   ("CtlBusFaults", 0x4B3, ("rx_drops", "tx_drops", "rejected")))},
+    "PlantControl": (0x6B1, "PLANT", 1000, {
+        "obeys": (12, 2, False, 1, 0, False), "commands": (16, *U16, 1, 0, False),
+        "refused": (32, *U16, 1, 0, False), "fallback_ticks": (48, *U16, 1, 0, False)}),
+    "CtlIdentity": (0x7A8, "CONTROLLER", 10000, {
+        "dbc_hash": (16, 24, False, 1, 0, False), "weights_hash": (40, 24, False, 1, 0, False)}),
+    "CtlBuild": (0x7A9, "CONTROLLER", 10000, {
+        "controller_id": (12, 4, False, 1, 0, False), "build_hash": (16, 24, False, 1, 0, False),
+        "preview_hash": (40, 24, False, 1, 0, False)}),
 }  # fmt: skip
+
+# The controller's loop tells its timing in the estimator's layout: what sends it packs both with the same code.
+TIMING = ("TimingA", "TimingB", "TimingC", "TimingD", "Releases", "Misses", "Overload", "MissRun", "Outputs",
+          "Environment", "Machine", "Canary", "WakeStat", "ExecStat", "RespStat", "Granted")  # fmt: skip
+OTHER_NAME = {"in_age_temp_us": "in_age_estimate_us"}
+
+
+def shifted(name: str) -> tuple:
+    can_id, _, cycle, signals = CONTRACT[f"Est{name}"]
+    by = 8 if name == "Granted" else 16
+    return can_id + by, "CONTROLLER", cycle, {OTHER_NAME.get(n, n): layout for n, layout in signals.items()}
+
+
+CONTRACT.update({f"Ctl{name}": shifted(name) for name in TIMING})
 
 
 def test_the_file_is_the_agreed_contract():
@@ -131,7 +176,8 @@ def test_the_file_is_the_agreed_contract():
     assert all(m.length == 8 and not m.codec.is_extended_frame for m in dbc)
     assert {m.name for m in dbc if m.simulation_only} == {"TruthTemp", "TruthVehicle", "TruthFault", "PlantSample"}
     content = {"Estimate", "EstimateInnov", "EstValidity", "EstWinding", "EstRotor"}
-    assert {m.name for m in dbc if m.per_job} == content | {f"EstTiming{x}" for x in "ABCD"}
+    content |= {"TorqueCommand", "CtlState", "CtlSolve"}
+    assert {m.name for m in dbc if m.per_job} == content | {f"{who}Timing{x}" for who in ("Est", "Ctl") for x in "ABCD"}
     assert dbc["EstBuild"].signals[-1].raw_max == 254, "any setting has a number"
 
 

@@ -36,7 +36,7 @@ BROKEN = [
     ("length", " SG_ tick : 48|16@1+", " SG_ tick : 50|16@1+", False),
     ("overlap", " SG_ torque_nm : 16|16@1-", " SG_ torque_nm : 8|16@1-", False),
     ("node", "BO_ 160 MotorState: 8 PLANT", "BO_ 160 MotorState: 8 Vector__XXX", True),
-    ("node", '[0|16383.5] "rpm" ESTIMATOR,LOGGER', '[0|16383.5] "rpm" GATEWAY', True),
+    ("node", '[0|16383.5] "rpm" ESTIMATOR,CONTROLLER,LOGGER', '[0|16383.5] "rpm" GATEWAY', True),
     ("comment", 'CM_ SG_ 160 speed_rpm "Mechanical speed of the rotor. Unit: rpm.";', "", True),
     ("comment", "Source: 70-node thermal network.", "", True),
     ("unit", '[0|16383.5] "rpm"', '[0|16383.5] "1/min"', True),

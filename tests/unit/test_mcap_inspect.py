@@ -88,7 +88,7 @@ def test_plain_text_says_all_of_it(tmp_path):
     text = stream.getvalue()
     for part in ("0x0A0  MotorState", "120 frames", "2023-11-14", "0x123 (1)",
                  "drive.dbc", "scenario=lap", "verdict: pass", "RMSE 0.100 degC (sensor 1.100 degC), worst n/a",
-                 "log: pass: none missing", "no frames of: TempMeas"):  # fmt: skip
+                 "log: pass: none missing", "no frames of: TempMeas", "not on the bus: CONTROLLER\n"):  # fmt: skip
         assert part in text
     assert "\x1b" not in text
 

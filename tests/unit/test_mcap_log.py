@@ -246,7 +246,7 @@ def test_disk_full(tmp_path):
     code = f"""
 import resource
 from tests.unit.test_mcap_log import *
-resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
 print(json.dumps(fill(Path({str(tmp_path / "full.mcap")!r}))))
 """
     ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
