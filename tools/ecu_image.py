@@ -21,6 +21,7 @@ ECU = BASE / "ecu"
 SETTINGS = BASE / "settings"
 STEP = (
     BASE / "src" / "mhe.c",
+    BASE / "src" / "mhe_loss.c",
     *sorted((BASE / "src" / "solver").glob("*.c")),
 )  # and the generated net: what is measured
 BENCH = ("replay", "an500_port", "startup", "memory")

@@ -14,7 +14,8 @@ void ekf_init(ekf_t *self, const est_setting_t *setting)
     }
 }
 
-void ekf_start(ekf_t *self, const double theta[EKF_CHANNELS], const double variance[EKF_CHANNELS], const double memory[])
+void ekf_start(ekf_t *self, const double theta[EKF_CHANNELS], const double variance[EKF_CHANNELS],
+               const double memory[])
 {
     memset(self->p, 0, sizeof self->p);
     for (int ch = 0; ch < EKF_CHANNELS; ch++) {

@@ -1,10 +1,11 @@
 /* Extended Kalman filter with the trained net as its model: state [theta(2), memory(NET_MEMORY)], noise on theta only.
  *
  * The baseline beside the moving horizon estimator, its stand-in when that gives no usable solution, and where its
- * uncertainty comes from: with quadratic loss and no active bound both are the same estimator. Derivatives of the net are
- * exact (its adjoint, row by row).
+ * uncertainty comes from: with quadratic loss and no active bound both are the same estimator. Derivatives of the net
+ * are exact (its adjoint, row by row).
  *
- * No allocation, no clock, no printing; one thread at a time per object; sizeof(ekf_t) = 3 kB with 8 cells, the caller's. */
+ * No allocation, no clock, no printing; one thread at a time per object; sizeof(ekf_t) = 3 kB with 8 cells, the
+ * caller's. */
 #ifndef EKF_H
 #define EKF_H
 
@@ -25,7 +26,8 @@ typedef struct {
 void ekf_init(ekf_t *self, const est_setting_t *setting);
 
 /* Begin at that temperature, known to `variance` (K^2), and that memory of the net, taken as known. Never fails. */
-void ekf_start(ekf_t *self, const double theta[EKF_CHANNELS], const double variance[EKF_CHANNELS], const double memory[]);
+void ekf_start(ekf_t *self, const double theta[EKF_CHANNELS], const double variance[EKF_CHANNELS],
+               const double memory[]);
 
 /* One step of the net with u = [speed rpm, torque Nm]. One net step, NET_MEMORY + 2
  * adjoints and two products of EKF_N x EKF_N matrices: about 45 thousand instructions with 8 cells. Never fails. */

@@ -6,8 +6,8 @@
  * newest measurement speaks, and the net runs forward from there to now with the stored inputs. Between two intervals
  * the estimate follows the rate that the net gives for the motor frames received so far.
  *
- * Everything: no allocation, no printing; one thread at a time per object; state sizeof(estimator_t) (27 kB with 8 cells),
- * owned by the caller. */
+ * Everything: no allocation, no printing; one thread at a time per object; state sizeof(estimator_t) (27 kB with 8
+ * cells), owned by the caller. */
 #ifndef ESTIMATOR_H
 #define ESTIMATOR_H
 
@@ -26,19 +26,20 @@ typedef enum {
     ESTIMATOR_INIT = 0,        /* nothing to work on yet */
     ESTIMATOR_STARTING = 1,    /* frames arrive, but no measurement speaks for a known interval yet */
     ESTIMATOR_RUNNING = 2,
-    ESTIMATOR_PREDICTING = 3,  /* a channel has no measurement for longer than the setting's timeout, or a sensor that is not
-                                * believed: the net alone. A channel that never had one started at the other's temperature */
+    ESTIMATOR_PREDICTING = 3,  /* a channel has no measurement for longer than the setting's timeout, or a sensor that
+                                * is not believed: the net alone. A channel that never had one started at the other's
+                                * temperature */
     ESTIMATOR_INPUT_STALE = 4, /* the newest interval had no motor frame: its input was held */
     ESTIMATOR_INVALID = 5,     /* a result was not finite; the estimator has started again */
     ESTIMATOR_OPEN_LOOP = 6,   /* a channel without a trusted sensor for longer than the setting's limit */
-    ESTIMATOR_FALLBACK = 7,    /* the MHE gave no usable solution: the estimate is the Kalman filter's. Goes before 3 and 6 */
+    ESTIMATOR_FALLBACK = 7,    /* no usable solution of the MHE: the estimate is the Kalman filter's. Before 3 and 6 */
 } estimator_status_t;
 
 /* One temperature, beside its estimate. */
 typedef struct {
     sensor_class_t fault;    /* of its sensor */
     bool trusted;            /* the newest measurement counts in the estimate */
-    double sigma_degc;       /* standard deviation of the estimate, the filter's at the newest measurement; NAN before the first */
+    double sigma_degc;       /* standard deviation, the filter's at the newest measurement; NAN before the first */
     double upper_degc;       /* conservative upper bound of the temperature; NAN before the first */
     double innov_sigma_degc; /* predicted standard deviation of the innovation; NAN if none came since */
 } estimator_channel_t;
@@ -106,7 +107,8 @@ typedef struct {
     /* Start. */
     double early_sum[MHE_CHANNELS];    /* measurements that speak for nodes before the first one */
     int32_t early_count[MHE_CHANNELS];
-    int32_t fallback_left[MHE_CHANNELS]; /* measurements to come until a channel that started without any is as good as others */
+    int32_t fallback_left[MHE_CHANNELS]; /* a channel that started without a measurement: so many to come until it is
+                                          * as good as others */
     bool started;
 
     /* Solution at the newest grid node. */
@@ -115,7 +117,7 @@ typedef struct {
     validity_t validity;
     double innovation[MHE_CHANNELS];   /* not yet published */
     bool awaited[MHE_CHANNELS];        /* the newest node's measurement may still come */
-    double resume_degc[MHE_CHANNELS];  /* after a restart: the last estimate of a channel whose sensor is not believed */
+    double resume_degc[MHE_CHANNELS];  /* after a restart: last estimate where the sensor is not believed */
     double innovation_variance[MHE_CHANNELS];
     double variance[MHE_CHANNELS];     /* of theta, K^2 */
     bool measurement_pending;          /* a late measurement entered the window after its step */
@@ -126,9 +128,9 @@ typedef struct {
 /* Start empty with a copy of `setting`. < 5 us. ESTIMATOR_BAD_SETTING leaves the object unusable. */
 estimator_error_t estimator_init(estimator_t *self, const est_setting_t *setting);
 
-/* Take one MotorState. valid = false (or a value not finite or beyond 1e6): the tick counts, the values do not. A frame whose
- * tick went backwards or more than max_gap_steps intervals ahead is not used; the second in a row restarts the estimator.
- * Never fails. < 0.1 us. */
+/* Take one MotorState. valid = false (or a value not finite or beyond 1e6): the tick counts, the values do not. A
+ * frame whose tick went backwards or more than max_gap_steps intervals ahead is not used; the second in a row restarts
+ * the estimator. Never fails. < 0.1 us. */
 void estimator_feed_motor(estimator_t *self, uint16_t tick16, double torque_nm, double speed_rpm, bool valid);
 
 /* Take one TempMeas as it came from the sensor, offset included. Never fails. < 0.1 us. */
@@ -144,7 +146,8 @@ void estimator_feed_coolant(estimator_t *self, double coolant_degc, bool soaked,
  * measurement arrived after its interval had been consumed. Never fails: trouble is in out->status. */
 void estimator_step(estimator_t *self, estimator_out_t *out);
 
-/* After publishing: in mode feedback the rest of the last solution, as long as mhe_solve() takes; else nothing. Never fails. */
+/* After publishing: in mode feedback the rest of the last solution, as long as mhe_solve() takes; else nothing. Never
+ * fails. */
 void estimator_finish(estimator_t *self);
 
 #endif

@@ -3,15 +3,18 @@
 #include <math.h>
 #include <string.h>
 
-static const double FEEDBACK_KKT_DEGC = 1.0;  /* and what one sweep may leave to the next */
-static const double DOUBT_MAX = 10.0;         /* K^2, up to which doubt about the net adds */
+static const int32_t MEMORY_STEPS = 200;      /* 20 s: so long the filter learns what the net should remember */
+static const double USABLE_KKT_DEGC = 0.01;   /* an MHE cut short is still used below this ... */
+static const double FEEDBACK_KKT_DEGC = 1.0;  /* ... and one sweep may leave that to the next step */
 static const double CREEP_VARIANCE = 0.25;    /* K^2, of the slow observer's level */
-static const double USABLE_KKT_DEGC = 0.01;   /* an MHE cut short is still used below this */
+
+/* Doubt outside what the net knows. */
 static const double DOUBT = 1.0;              /* K^2 per step, one half-width outside the envelope */
-static const double LACK_S = 3.0;
-static const double LACK_USUAL = 0.03;         /* degC/s */
-static const double NOVELTY_MAX = 10.0;
-static const int32_t MEMORY_STEPS = 200;      /* 20 s: until then the filter still learns what the net should remember */
+static const double DOUBT_MAX = 10.0;         /* K^2, up to which it adds */
+
+/* What the net's rate lacks with this plant, as the slow observer has learned it. */
+static const double LACK_USUAL = 0.03;        /* degC/s: no more than any net's ordinary error */
+static const double LACK_S = 3.0;             /* how long a lack beyond that keeps its sign, as the window sees it */
 
 void fusion_init(fusion_t *self, const est_setting_t *setting)
 {
@@ -38,19 +41,18 @@ static bool uses_mhe(const fusion_t *self)
     return self->setting.kind == EST_KIND_MHE;
 }
 
-/* A rate that is wrong by m for a time tau moves the temperature as noise of variance 2 tau m^2 dt per step would. What the
- * slow observer has learned to be wrong is taken for m as far as it is more than any net's ordinary error. */
+/* A rate that is wrong by m for a time tau (LACK_S) moves the temperature as noise of variance 2 tau m^2 dt per step
+ * would. What the slow observer has learned to be wrong is taken for m as far as it is more than LACK_USUAL. */
 static void set_noise(fusion_t *self)
 {
     for (int ch = 0; ch < MHE_CHANNELS && self->setting.supervise; ch++) {
         const double m = fmax(0.0, fabs(self->slow.bias[ch]) - LACK_USUAL);
-        const double q = 1.0 / self->setting.weight_noise[ch] + 2.0 * LACK_S * NET_DT_S * m * m;
-        self->ekf.q[ch] = q;
+        self->ekf.q[ch] = 1.0 / self->setting.weight_noise[ch] + 2.0 * LACK_S * NET_DT_S * m * m;
     }
 }
 
-/* Arrival cost: the filter's prediction of the oldest node says what all measurements before the window say. With it the MHE
- * begins where the filter stood, and no measurement counts twice. */
+/* Arrival cost: the filter's prediction of the oldest node says what all measurements before the window say. With it
+ * the MHE begins where the filter stood, and no measurement counts twice. */
 static void begin_at_oldest(fusion_t *self)
 {
     if (!uses_mhe(self) || self->setting.arrival_from != EST_ARRIVAL_FROM_FILTER || !self->mhe.full) {
@@ -89,8 +91,8 @@ void fusion_advance(fusion_t *self, const double u[2])
     slow_observer_predict(&self->slow, u);
 }
 
-/* Hand the noise to the MHE, and the loss's scale: it bends where values are out of the ordinary, and with a noisy sensor the
- * ordinary is wider. */
+/* Hand the noise to the MHE, and the loss's scale: it bends where values are out of the ordinary, and with a noisy
+ * sensor the ordinary is wider. */
 static void weigh(fusion_t *self)
 {
     double noise[MHE_CHANNELS];
@@ -101,7 +103,8 @@ static void weigh(fusion_t *self)
         wider = fmax(wider, monitor->spread_r / monitor->r);
     }
     const double scale = self->setting.loss_scale_degc * sqrt(wider);
-    if (noise[0] != self->mhe.weight_noise[0] || noise[1] != self->mhe.weight_noise[1] || scale != self->mhe.loss_scale) {
+    const double *now = self->mhe.weight_noise;
+    if (noise[0] != now[0] || noise[1] != now[1] || scale != self->mhe.loss_scale) {
         mhe_weigh(&self->mhe, noise, scale);
     }
 }
@@ -111,7 +114,7 @@ void fusion_doubt(fusion_t *self, double novelty)
     if (!(novelty > 1.0)) { /* NAN where the weights carry no envelope */
         return;
     }
-    const double beyond = fmin(novelty, NOVELTY_MAX) - 1.0;
+    const double beyond = novelty - 1.0;
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         const double room = fmax(0.0, DOUBT_MAX - self->ekf.p[ch][ch]);
         self->ekf.p[ch][ch] += fmin(room, DOUBT * beyond * beyond);
@@ -215,23 +218,37 @@ static bool ekf_finite(const ekf_t *ekf)
     return isfinite(sum);
 }
 
-void fusion_solve(fusion_t *self, fusion_estimate_t *estimate)
+/* A window that is not finite stays so: begin another where the filter stands, if that is finite. */
+static void mend_window(fusion_t *self, mhe_status_t status)
+{
+    if (status == MHE_INVALID && ekf_finite(&self->ekf)) {
+        mhe_start(&self->mhe, self->ekf.theta, self->ekf.memory);
+    }
+}
+
+/* The MHE's part of fusion_solve(): its status as published. True: its solution can be used. */
+static bool solve_window(fusion_t *self, mhe_status_t *status)
 {
     mhe_result_t *result = &self->result;
     const bool feedback = self->setting.mode == EST_MODE_FEEDBACK && self->mhe.full; /* a young window needs more */
-    *result = (mhe_result_t){.kkt_degc = NAN};
-    *estimate = (fusion_estimate_t){.status = MHE_OK};
-    bool solved = false;
-    if (uses_mhe(self)) {
-        if (self->setting.supervise) {
-            weigh(self);
-        }
-        estimate->status = feedback ? mhe_feedback(&self->mhe, result) : mhe_solve(&self->mhe, result);
-        solved = estimate->status == MHE_OK ||
-                 (estimate->status == MHE_MAX_SWEEPS && result->kkt_degc < (feedback ? FEEDBACK_KKT_DEGC : USABLE_KKT_DEGC));
-        self->unfinished = feedback && estimate->status == MHE_MAX_SWEEPS;
-        estimate->status = self->unfinished ? MHE_OK : estimate->status;
+    const double left_degc = feedback ? FEEDBACK_KKT_DEGC : USABLE_KKT_DEGC;
+    if (self->setting.supervise) {
+        weigh(self);
     }
+    *status = feedback ? mhe_feedback(&self->mhe, result) : mhe_solve(&self->mhe, result);
+    const bool cut_short = *status == MHE_MAX_SWEEPS;
+    const bool solved = *status == MHE_OK || (cut_short && result->kkt_degc < left_degc);
+    self->unfinished = feedback && cut_short;
+    *status = self->unfinished ? MHE_OK : *status;
+    return solved;
+}
+
+void fusion_solve(fusion_t *self, fusion_estimate_t *estimate)
+{
+    const mhe_result_t *result = &self->result;
+    self->result = (mhe_result_t){.kkt_degc = NAN};
+    *estimate = (fusion_estimate_t){.status = MHE_OK};
+    const bool solved = uses_mhe(self) && solve_window(self, &estimate->status);
     estimate->kkt_degc = result->kkt_degc;
     estimate->sweeps = result->sweeps;
     estimate->usable = solved || ekf_finite(&self->ekf);
@@ -241,9 +258,7 @@ void fusion_solve(fusion_t *self, fusion_estimate_t *estimate)
         estimate->variance[ch] = self->ekf.p[ch][ch];
     }
     estimate->memory = solved ? mhe_node(&self->mhe, 0)->memory : self->ekf.memory;
-    if (estimate->status == MHE_INVALID && estimate->usable) {
-        mhe_start(&self->mhe, self->ekf.theta, self->ekf.memory); /* a window that is not finite stays so */
-    }
+    mend_window(self, estimate->status);
 }
 
 mhe_status_t fusion_finish(fusion_t *self)
@@ -253,8 +268,6 @@ mhe_status_t fusion_finish(fusion_t *self)
     }
     self->unfinished = false;
     const mhe_status_t status = mhe_finish(&self->mhe, &self->result);
-    if (status == MHE_INVALID && ekf_finite(&self->ekf)) {
-        mhe_start(&self->mhe, self->ekf.theta, self->ekf.memory);
-    }
+    mend_window(self, status);
     return status;
 }

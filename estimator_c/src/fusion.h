@@ -3,8 +3,8 @@
  *   u ─→ MHE, EKF, slow observer one step ahead ─→ monitor per sensor: what is this value worth?
  *                                                      └→ MHE solves │ EKF updates │ slow observer compares
  *
- * The MHE's estimate is published; the EKF gives the variance, and the estimate where the MHE has none or the setting says
- * so. All see the same shares of the same values.
+ * The MHE's estimate is published; the EKF gives the variance, and the estimate where the MHE has none or the setting
+ * says so. All see the same shares of the same values.
  *
  * No allocation, no clock, no printing; one thread at a time per object; the caller owns it (18 kB with 8 cells). */
 #ifndef FUSION_H
@@ -60,22 +60,23 @@ void fusion_start(fusion_t *self, const double prior[MHE_CHANNELS], const double
 /* One step of the net with u = [speed rpm, torque Nm]. Never fails. */
 void fusion_advance(fusion_t *self, const double u[2]);
 
-/* The last step was outside what the net knows, `novelty` half-widths from the middle (see validity.h): the prediction is
- * worth less, so that it does not condemn a sound sensor. Up to 1: nothing happens. */
+/* The last step was outside what the net knows, `novelty` half-widths from the middle (see validity.h): the prediction
+ * is worth less, so that it does not condemn a sound sensor. Up to 1: nothing happens. */
 void fusion_doubt(fusion_t *self, double novelty);
 
 /* The value of a channel for the newest node, offset removed (NAN: none), and as the sensor gave it. Once per step and
  * channel. Returns the innovation (NAN: none) and its predicted variance. */
 double fusion_measure(fusion_t *self, int channel, double y, double raw, double *variance);
 
-/* A value for a node `age` > 0 steps back, later than the next value. It enters the MHE's window if the monitor would have let it,
- * not the filter. Returns the innovation; NAN: too late, or no MHE. */
+/* A value for a node `age` > 0 steps back, later than the next value. It enters the MHE's window if the monitor would
+ * have let it, not the filter. Returns the innovation; NAN: too late, or no MHE. */
 double fusion_measure_late(fusion_t *self, int age, int channel, double y, double raw);
 
 /* Solve and give the estimate at the newest node; in mode feedback, after one sweep. */
 void fusion_solve(fusion_t *self, fusion_estimate_t *estimate);
 
-/* Mode feedback: the rest of the solution, which the next step begins from. Returns its status; MHE_OK where nothing is left. */
+/* Mode feedback: the rest of the solution, which the next step begins from. Returns its status; MHE_OK where nothing is
+ * left. */
 mhe_status_t fusion_finish(fusion_t *self);
 
 #endif

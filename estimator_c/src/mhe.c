@@ -2,6 +2,8 @@
 
 #include <string.h>
 
+#include "mhe_loss.h"
+
 /* Rounding of temperatures around 100 degC leaves changes of that size: nothing with double, 15 uK with float. */
 static const real_t TOLERANCE_FLOOR_DEGC = 128 * REAL_EPSILON;
 
@@ -119,7 +121,8 @@ void mhe_advance(mhe_t *self, const real_t u[2])
     }
 }
 
-void mhe_arrival(mhe_t *self, const real_t prior[MHE_CHANNELS], const real_t weight[MHE_CHANNELS], const real_t memory[])
+void mhe_arrival(mhe_t *self, const real_t prior[MHE_CHANNELS], const real_t weight[MHE_CHANNELS],
+                 const real_t memory[])
 {
     memcpy(self->prior, prior, sizeof self->prior);
     memcpy(self->weight_arrival, weight, sizeof self->weight_arrival);
@@ -173,63 +176,8 @@ const mhe_node_t *mhe_node(const mhe_t *self, int age)
     return &self->node[(self->head + self->count - 1 - age) & (MHE_NODES - 1)];
 }
 
-/* What the loss does with the residuals of a window: factors on the measurement's weight. */
-typedef struct {
-    real_pair_t residual[MHE_NODES]; /* degC, theta minus y */
-    real_pair_t pull[MHE_NODES];     /* in the gradient: the derivative of rho over the residual */
-    real_pair_t curvature[MHE_NODES]; /* in the matrix */
-} losses_t;
-
-/* Huber 1965, Geman and McClure 1987. The curvature: with `careful` the same as the pull, a parabola above the loss that
- * touches it, so that no step can climb; else the loss's own curvature, which ends in fewer sweeps, where that is not
- * negative. All nodes of the ring, in use or not: a loop of known length is computed two numbers at a time. */
-static void weigh(const mhe_t *self, bool careful, losses_t *out)
-{
-    const real_t per_scale = 1 / self->loss_scale;
-    for (int k = 0; k < MHE_NODES; k++) {
-        const mhe_node_t *node = &self->node[(self->head + k) & (MHE_NODES - 1)];
-        for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-            out->residual[k][ch] = node->theta[ch] - node->y[ch];
-            out->pull[k][ch] = 1;
-            out->curvature[k][ch] = 1;
-        }
-    }
-    if (self->loss == EST_LOSS_GEMAN_MCCLURE) {
-        for (int k = 0; k < MHE_NODES; k++) {
-            for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-                const real_t x = out->residual[k][ch] * per_scale;
-                const real_t d = 1 / (1 + x * x);
-                const real_t own = (1 - 3 * x * x) * d; /* times the pull */
-                const real_t kept = (own + real_abs(own)) * (real_t)0.5;
-                out->pull[k][ch] = d * d;
-                out->curvature[k][ch] = d * d * (careful ? 1 : kept);
-            }
-        }
-    } else if (self->loss == EST_LOSS_HUBER) {
-        for (int k = 0; k < MHE_NODES; k++) {
-            for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-                const real_t x = real_abs(out->residual[k][ch] * per_scale);
-                out->pull[k][ch] = 1 / real_max(x, 1);
-                out->curvature[k][ch] = careful ? out->pull[k][ch] : x > 1 ? 0 : 1;
-            }
-        }
-    }
-}
-
-/* The loss itself over its scale squared is rho(x); here times the scale squared, 1/2 r^2 where r is small. */
-static real_t loss_value(const mhe_t *self, real_t r)
-{
-    const real_t half = (real_t)0.5;
-    const real_t s = self->loss_scale;
-    const real_t x = real_abs(r / s);
-    if (self->loss == EST_LOSS_GEMAN_MCCLURE) {
-        return half * r * r / (1 + x * x);
-    }
-    return self->loss == EST_LOSS_HUBER && x > 1 ? s * s * (x - half) : half * r * r;
-}
-
 /* Gradient of the cost at the point of the last forward sweep. */
-static void adjoint_sweep(mhe_t *self, const losses_t *losses)
+static void adjoint_sweep(mhe_t *self, const mhe_losses_t *losses)
 {
     const real_t *p0 = arrival_weight(self);
     const int last = self->count - 1;
@@ -267,9 +215,9 @@ static void adjoint_sweep(mhe_t *self, const losses_t *losses)
     }
 }
 
-/* Gauss-Newton matrix of each channel with the direct slope of each stage; constant within a step unless the loss weighs
- * the residuals anew. */
-static void factor(mhe_t *self, const losses_t *losses)
+/* Gauss-Newton matrix of each channel with the direct slope of each stage; constant within a step unless the loss
+ * weighs the residuals anew. */
+static void factor(mhe_t *self, const mhe_losses_t *losses)
 {
     const real_t *p0 = arrival_weight(self);
     const int last = self->count - 1;
@@ -348,10 +296,10 @@ static real_t tridiagonal_step(mhe_t *self, real_pair_t step[], int *active, boo
 static void sweep(mhe_t *self, mhe_result_t *result)
 {
     real_pair_t step[MHE_NODES];
-    losses_t losses;
+    mhe_losses_t losses;
     const real_t before = result->kkt_degc;
     bool settled = true;
-    weigh(self, self->careful, &losses);
+    mhe_losses(self, self->careful, &losses);
     if (result->sweeps == 0 || self->loss != EST_LOSS_QUADRATIC) {
         factor(self, &losses);
     }
@@ -365,7 +313,7 @@ static void sweep(mhe_t *self, mhe_result_t *result)
             at(self, k)->theta[ch] += step[k][ch];
         }
     }
-    self->stale = !self->converged; /* the last step, within the tolerance, makes the estimate better but moves no stage */
+    self->stale = !self->converged; /* the last step, within the tolerance, betters the estimate but moves no stage */
 }
 
 /* Close the books of a solve: the estimate, and whether all of it is finite. */
@@ -420,9 +368,9 @@ real_t mhe_cost(mhe_t *self, real_t gradient[][MHE_CHANNELS])
     const real_t half = (real_t)0.5;
     const real_t *p0 = arrival_weight(self);
     real_t cost = 0;
-    losses_t losses;
+    mhe_losses_t losses;
     forward_sweep(self);
-    weigh(self, true, &losses);
+    mhe_losses(self, true, &losses);
     adjoint_sweep(self, &losses);
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         const real_t from_prior = at(self, 0)->theta[ch] - self->prior[ch];
@@ -430,7 +378,7 @@ real_t mhe_cost(mhe_t *self, real_t gradient[][MHE_CHANNELS])
         for (int k = 0; k < self->count; k++) {
             const mhe_node_t *node = at(self, k);
             const real_t residual = node->theta[ch] - node->y[ch];
-            cost += weight_at(self, k, ch) * loss_value(self, residual);
+            cost += weight_at(self, k, ch) * mhe_loss_value(self, residual);
             if (k + 1 < self->count) {
                 const real_t w = at(self, k + 1)->theta[ch] - node->theta[ch] - NET_DT_S * node->rate[ch];
                 cost += half * self->weight_noise[ch] * w * w;

@@ -52,7 +52,8 @@ void offset_calibration_moving(offset_calibration_t *self)
     }
 }
 
-/* The mean of a channel's values if that can be an offset; else the datasheet's stays, as uncertain as the mean is far away. */
+/* The mean of a channel's values if that can be an offset; else the datasheet's stays, as uncertain as the mean is far
+ * away. */
 static bool take(offset_calibration_t *self, int ch)
 {
     const double variance = self->m2[ch] / (VALUES - 1);

@@ -8,8 +8,8 @@
  *   slow innovation as such, against what is usual                  → drift
  *
  * A sensor that stepped away and scatters as it should still shows changes: its values count a little, less the step.
- * A distrusted sensor is believed again after some seconds in which its values agree with the prediction, within what the
- * prediction may have lost meanwhile, and scatter as they should. Two faults at once show as the graver one.
+ * A distrusted sensor is believed again after some seconds in which its values agree with the prediction, within what
+ * the prediction may have lost meanwhile, and scatter as they should. Two faults at once show as the graver one.
  *
  * No allocation, no clock, no printing; one thread at a time per object; < 1 kB. */
 #ifndef SENSOR_MONITOR_H
@@ -87,5 +87,15 @@ monitor_verdict_t sensor_monitor_step(sensor_monitor_t *self, const monitor_inpu
 
 /* Judge a value that came after its step: its share. Changes nothing. */
 double sensor_monitor_late(const sensor_monitor_t *self, double raw, double residual, double variance);
+
+/* Can the sensor's value be one at all? Open and shorted sensors give others; NAN is none. Never fails. */
+bool sensor_monitor_in_range(const sensor_monitor_t *self, double raw);
+
+/* For how long the sensor has not been believed, s; 0 while it is. Never fails. */
+double sensor_monitor_distrusted_s(const sensor_monitor_t *self);
+
+/* How far the machine may have moved from what the net says of it since then, degC: 0.05 a second, at most 10. As much
+ * is added to the upper bound, and as far off the sensor may be when it comes back. Never fails. */
+double sensor_monitor_gained_degc(const sensor_monitor_t *self);
 
 #endif

@@ -1,9 +1,9 @@
-/* The net held to the measurements by a very weak pull: what the temperatures would be if the sensors were trusted over
- * minutes only. Its innovation shows what creeps, which an estimator that follows within seconds cannot show.
+/* The net held to the measurements by a very weak pull: what the temperatures would be if the sensors were trusted
+ * over minutes only. Its innovation shows what creeps, which an estimator that follows within seconds cannot show.
  *
- * A proportional-integral observer: innovation e, d theta/dt = F + bias + e/T, d bias/dt = e/(T Ti), T and Ti growing from the
- * start as the record grows (as the gains of a Kalman filter shrink). bias is then what the net's rate lacks with this
- * plant: coolant colder than it was trained with, say.
+ * A proportional-integral observer: innovation e, d theta/dt = F + bias + e/T, d bias/dt = e/(T Ti), T and Ti growing
+ * from the start as the record grows (as the gains of a Kalman filter shrink). bias is then what the net's rate lacks
+ * with this plant: coolant colder than it was trained with, say.
  *
  * No allocation, no clock, no printing; one thread at a time per object; < 300 bytes with 8 cells. */
 #ifndef SLOW_OBSERVER_H

@@ -17,7 +17,9 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-CORE = ("mhe", "ekf", "slow_observer", "sensor_monitor", "fusion", "offset_calibration", "estimator", "validity")
+CORE = ("mhe", "mhe_loss", "ekf", "slow_observer", "sensor_monitor", "fusion", "offset_calibration", "validity",
+        "estimator", "estimator_feed", "estimator_publish")  # fmt: skip
+MHE = ("src/mhe.c", "src/mhe_loss.c")
 SOLVER = tuple(f"src/solver/{name}.c" for name in ("tridiag", "tridiag_pair", "box_qp"))
 SOURCES = (*(f"src/{name}.c" for name in CORE), "src/est_batch.c", *SOLVER)
 SETTINGS = ROOT / "estimator_c" / "settings"

@@ -14,7 +14,7 @@ from estimator_c.formulation.generate import generate
 from estimator_c.formulation.mhe import MheOracle, MheProblem
 from estimator_c.formulation.real import FLOAT, REALS
 from estimator_c.formulation.weights import NetWeights, load_weights
-from tests.support.libest import NODES, ROOT, SETTINGS, SOLVER, WEIGHTS, Lib, Setting, compile_library
+from tests.support.libest import MHE, NODES, ROOT, SETTINGS, SOLVER, WEIGHTS, Lib, Setting, compile_library
 from tests.support.mhe_recorder import Record, Recorder, record
 
 AGREEMENT_DEGC = 1e-6
@@ -157,7 +157,7 @@ class Mhe32:
     def __init__(self, folder: Path, setting: Setting) -> None:
         base = ROOT / "estimator_c"
         generate(WEIGHTS, SETTINGS, folder, FLOAT)
-        sources = [base / "src" / "mhe.c", *(base / name for name in SOLVER), *folder.glob("thermal_net*.c")]
+        sources = [*(base / name for name in (*MHE, *SOLVER)), *folder.glob("thermal_net*.c")]
         strict = ["-std=c11", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror"]
         includes = [f"-I{folder}", f"-I{base / 'src'}", f"-I{base / 'src' / 'solver'}"]
         library = folder / "libmhe32.so"
@@ -243,7 +243,7 @@ def test_no_undefined_behaviour_in_any_kernel(tmp_path: Path) -> None:
         folder = tmp_path / f"{cell}{layers}{hidden}"
         folder.mkdir()
         generate(random_net(folder, hidden, cell=cell, layers=layers), SETTINGS, folder)
-        sources = [ROOT / "tests" / "c" / "test_mhe_kernels.c", base / "src" / "mhe.c"]
+        sources = [ROOT / "tests" / "c" / "test_mhe_kernels.c", *(base / name for name in MHE)]
         sources += [*(base / name for name in SOLVER), *folder.glob("thermal_net*.c"), folder / "est_settings.c"]
         includes = [f"-I{folder}", f"-I{base / 'src'}", f"-I{base / 'src' / 'solver'}"]
         sanitize = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]

@@ -1,5 +1,5 @@
-/* Eight doubles side by side on AVX-512, for the generated thermal_net_avx512.c and nothing else. vec_..._part: the first n
- * of a vector, the rest 0; n is a constant wherever it is called. */
+/* Eight doubles side by side on AVX-512, for the generated thermal_net_avx512.c and nothing else. vec_..._part: the
+ * first n of a vector, the rest 0; n is a constant wherever it is called. */
 #ifndef VEC_AVX512_H
 #define VEC_AVX512_H
 
@@ -87,35 +87,41 @@ VEC_INLINE double vec_sum(vec_t x)
     return _mm_cvtsd_f64(_mm_add_sd(two, _mm_unpackhi_pd(two, two)));
 }
 
-/* 1/(1 + 2^a) for |a| < 1e15, absolute error <= 3e-16; the ends are held within 2^-63 of 0 and 1; NaN gives NaN, an
- * infinite a its end or NaN. The polynomial is that of net_gates(). The power of two is made beside the polynomial, which
- * takes longer. */
-VEC_INLINE vec_t vec_gate(vec_t a)
+/* The second operand where one is NaN. */
+VEC_INLINE vec_t vec_min(vec_t a, vec_t b)
 {
-    const vec_t one = vec_all(1.0);
-    const vec_t shift = vec_all(6755399441055744.0); /* 1.5 2^52: adding it rounds to a whole number */
-    const vec_t shifted = vec_add(a, shift);
-    const vec_t r = _mm512_reduce_pd(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); /* a - whole number */
-    const vec_t most = vec_all(6755399441055744.0 + 63.0);
-    const vec_t least = vec_all(6755399441055744.0 - 64.0);
-    const vec_t held = _mm512_min_pd(most, _mm512_max_pd(least, shifted)); /* the second operand where it is NaN */
-    const __m512i bits = _mm512_slli_epi64(_mm512_add_epi64(_mm512_castpd_si512(held), _mm512_set1_epi64(1023)), 52);
-    const vec_t scale = _mm512_castsi512_pd(bits);
-    const vec_t r2 = vec_mul(r, r);
-    const vec_t r4 = vec_mul(r2, r2);
-    const vec_t r8 = vec_mul(r4, r4);
-    const vec_t p0 = vec_fma(r, vec_all(0.6931471805599462), one);
-    const vec_t p2 = vec_fma(r, vec_all(0.05550410866465167), vec_all(0.24022650695910075));
-    const vec_t p4 = vec_fma(r, vec_all(0.0013333558200794592), vec_all(0.009618129107618665));
-    const vec_t p6 = vec_fma(r, vec_all(1.5252672924850737e-05), vec_all(0.00015403530424776529));
-    const vec_t p8 = vec_fma(r, vec_all(1.0205905413765595e-07), vec_all(1.3215451633221434e-06));
-    const vec_t low = vec_fma(vec_fma(r2, p6, p4), r4, vec_fma(r2, p2, p0));
-    const vec_t below = vec_fma(vec_fma(vec_fma(r2, vec_all(7.070977866508138e-09), p8), r8, low), scale, one);
-    /* 1/below: an estimate to 2^-14 times the series of 1/(1 - t). A division takes the unit for 16 cycles, this for 4. */
-    const vec_t guess = _mm512_rcp14_pd(below);
-    const vec_t t = vec_fnma(below, guess, one);
+    return _mm512_min_pd(a, b);
+}
+
+VEC_INLINE vec_t vec_max(vec_t a, vec_t b)
+{
+    return _mm512_max_pd(a, b);
+}
+
+/* a less the whole number next to it, in one instruction that needs neither the shift nor a + shift. */
+VEC_INLINE vec_t vec_fraction(vec_t a, vec_t shifted, vec_t shift)
+{
+    (void)shifted;
+    (void)shift;
+    return _mm512_reduce_pd(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+}
+
+/* 2^n for shifted = shift + n. */
+VEC_INLINE vec_t vec_power_of_two(vec_t shifted)
+{
+    const __m512i exponent = _mm512_add_epi64(_mm512_castpd_si512(shifted), _mm512_set1_epi64(1023));
+    return _mm512_castsi512_pd(_mm512_slli_epi64(exponent, 52));
+}
+
+/* An estimate to 2^-14 times the series of 1/(1 - t). A division takes the unit for 16 cycles, this for 4. */
+VEC_INLINE vec_t vec_reciprocal(vec_t a)
+{
+    const vec_t guess = _mm512_rcp14_pd(a);
+    const vec_t t = vec_fnma(a, guess, vec_all(1.0));
     const vec_t better = vec_fma(guess, t, guess);
     return vec_fma(better, vec_mul(t, t), better);
 }
+
+#include "vec_gate.h"
 
 #endif

@@ -1,7 +1,7 @@
-/* Two symmetric positive definite tridiagonal systems side by side, factored from both ends towards the middle: four chains
- * of n/2 divisions that do not wait for each other, where one system alone would be a chain of n.
- * Both functions: no allocation, no failure for positive definite matrices (others give a non-finite result), any thread,
- * 1 <= n <= TRIDIAG_MAX; cost 2 n divisions (factor), about 100 flops (solve) at n = 16. */
+/* Two symmetric positive definite tridiagonal systems side by side, factored from both ends towards the middle: four
+ * chains of n/2 divisions that do not wait for each other, where one system alone would be a chain of n. Both
+ * functions: no allocation, no failure for positive definite matrices (others give a non-finite result), any thread, 1
+ * <= n <= TRIDIAG_MAX; cost 2 n divisions (factor), about 100 flops (solve) at n = 16. */
 #ifndef TRIDIAG_PAIR_H
 #define TRIDIAG_PAIR_H
 
