@@ -156,8 +156,8 @@ class LogReader:
                 f = kind.FromString(payload)
                 yield RawFrame(t_ns, f.id, f.data, f.dlc, f.flags)  # type: ignore[attr-defined]
 
-    def _messages(self) -> Iterator[tuple[_Registry, int, int, bytes]]:
-        registry = _Registry()
+    def chunks(self) -> Iterator[bytes]:
+        """Records of one chunk after the other, unpacked, for readers that decode in bulk; damaged ones are noted."""
         with self.path.open("rb") as file:
             for position, length in self._chunks:
                 file.seek(position)
@@ -168,7 +168,12 @@ class LogReader:
                     if note not in self.trouble:
                         self.trouble.append(note)
                     continue
-                yield from _walk(registry, data)
+                yield data
+
+    def _messages(self) -> Iterator[tuple[_Registry, int, int, bytes]]:
+        registry = _Registry()
+        for data in self.chunks():
+            yield from _walk(registry, data)
 
 
 def read_log(path: str | Path, names: Collection[str] | None = None) -> Iterator[LogFrame]:
