@@ -1,7 +1,7 @@
 # make run    the main job: sixty seconds of plant and estimator over CAN, judged, logged, drawn
 # make test   every test, on every bus this machine can have
 # make check  ruff, pyright, import rules, DBC lint
-# make bench  plant step, MHE step, bus: times and instruction counts
+# make bench  plant step, MHE step, real-time accounting, bus: times and instruction counts
 # make bench-ecu  the MHE step on an emulated Cortex-M7: instructions, flash, RAM, stack
 # make train  data set from the plant, then the net (about ten minutes)
 # make setup  .venv with rt-runner in it, and the C built
@@ -62,6 +62,7 @@ check: $(VENV)/.dev
 bench: $(VENV)/.dev build
 	$(PY) -m tools.bench_plant
 	$(PY) -m tools.bench_mhe
+	$(PY) -m tools.bench_rt
 	$(PY) -m tools.bench_bus --bus hub
 
 bench-ecu: $(VENV)/.dev

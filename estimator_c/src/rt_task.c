@@ -290,7 +290,9 @@ static void account_for_passed(rt_task *self, const rt_job *job) {
         rt_tally_overrun(&self->total, before_done - idle);
         rt_tally_overrun(window_tally(self, job->index), before_done - idle);
     }
-    skip_settled(self, job->index + 1U, self->owed_skips);
+    if (self->owed_skips > 0) {
+        skip_settled(self, job->index + 1U, self->owed_skips);
+    }
     if (before_done > self->seen_index) {
         pass(self, before_done, job->done_ns);
     }

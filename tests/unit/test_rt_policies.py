@@ -62,10 +62,10 @@ def test_rebase_moves_the_grid_and_tells_by_how_much(world):
 
 
 def test_cut_ends_the_solver_at_the_budget_counted_from_the_release(world):
-    long = quiet(cpu_ns=300 * US, iterations=10, wake_ns=100 * US)
+    long = quiet(cpu_ns=100 * US, iterations=10, wake_ns=150 * US)
     model = check(world, setting(tm.Policy("cut", budget_ns=600 * US)), [long, quiet(iterations=10)], [])
     assert [(job.cut, job.resp_ns, job.miss_late) for job in model.jobs] == [
-        (True, 700 * US, False),
+        (True, 650 * US, False),
         (False, 10 * US, False),
     ]
 
