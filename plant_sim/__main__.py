@@ -18,6 +18,7 @@ def main() -> int:
     parser.add_argument("--duration", type=float, help="seconds; default: the scenario's")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--fault", action="append", metavar="SPEC", help="a sensor fault beside the scenario's")
+    parser.add_argument("--obey", action="store_true", help="take torque commands from the bus; without them, the rule")
     args = parser.parse_args()
     if not args.lockstep and not args.bus:
         parser.error("--bus is needed (or --lockstep)")

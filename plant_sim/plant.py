@@ -161,6 +161,11 @@ class Plant:
         return driven > 0 and self.cycle.done(driven * DT_S, float(self._state[X]))
 
     @property
+    def driving(self) -> bool:
+        """Whether the next step is one of the cycle: not of the standstill at key-on."""
+        return self._tick >= self._key_on_ticks
+
+    @property
     def soaked(self) -> bool:
         """Whether this is the standstill at key-on, started at the coolant's temperature."""
         return self._soaked and self._tick <= self._key_on_ticks

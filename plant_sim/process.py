@@ -15,8 +15,9 @@ import can
 
 from plant_sim.faults import parse_fault
 from plant_sim.mismatch import Mismatch
+from plant_sim.obedience import FREE, Obedience
 from plant_sim.params import load_params
-from plant_sim.plant import CycleSpec, Plant
+from plant_sim.plant import CycleSpec, Plant, PlantSample
 from plant_sim.publisher import Publisher
 from rt_runner.bus import open_bus
 from rt_runner.config import Scenario, load_scenario, with_duration, with_faults
@@ -26,6 +27,7 @@ from rt_runner.records import END, TICK, control, pack, read_until_control
 
 TICK_NS = 10_000_000
 TX_PATIENCE = 100  # tries of 0.1 s each
+RX_MAX = 500  # frames read before a step; the rest waits for the next one
 TICKS_PER_INTERVAL = 10  # lock-step advances by 0.1 s
 
 
@@ -58,6 +60,31 @@ def _publisher(scenario: Scenario, plant: Plant) -> Publisher:
     return Publisher(load_dbc(), digest, scenario.sha256)
 
 
+class _Course:
+    """The plant on its way, obeying whom it has to: the driver, or what was heard of a controller."""
+
+    def __init__(self, plant: Plant, publisher: Publisher, obeys: bool) -> None:
+        self.plant = plant
+        self._publisher = publisher
+        self._obedience = Obedience(load_dbc(), plant.tick) if obeys else None
+
+    def hear(self, arbitration_id: int, data: bytes) -> None:
+        if self._obedience is not None:
+            self._obedience.hear(arbitration_id, data, self.plant.tick)
+
+    def step(self) -> tuple[PlantSample, list[can.Message]]:
+        """The next tick and what is to be sent of it."""
+        obedience, plant = self._obedience, self.plant
+        if obedience is None:
+            sample = plant.step()
+            return sample, self._publisher.frames(sample)
+        decision = obedience.decide(plant.tick) if plant.driving else FREE
+        sample = plant.step(decision.derate, decision.command)
+        if sample.tick % TICKS_PER_INTERVAL == 0:
+            obedience.measured(sample.tick, sample.theta_w_meas_degc, sample.theta_r_meas_degc)
+        return sample, self._publisher.frames(sample, decision, obedience)
+
+
 def run_realtime(args) -> int:
     """Publish one tick every 10 ms until the scenario's end, SIGTERM, or the end of stdin.
 
@@ -67,7 +94,8 @@ def run_realtime(args) -> int:
     plant = make_plant(scenario, args.seed)
     publisher = _publisher(scenario, plant)
     copy.deepcopy(plant).step()  # compiles, and loads what the first step would load
-    with open_bus(args.bus, receive=False) as bus:
+    course = _Course(plant, publisher, args.obey)
+    with open_bus(args.bus, receive=args.obey) as bus:
         _say({"ready": True, "tick": plant.tick, "t_s": plant.tick * TICK_NS / 1e9})
         if sys.stdin.readline().strip() != "go":
             return 0
@@ -83,8 +111,9 @@ def run_realtime(args) -> int:
                 if ahead_ns > 0:
                     time.sleep(ahead_ns / 1e9)
                 sample_ns, before_ns = time.time_ns(), time.monotonic_ns()
-                sample = plant.step()
-                motor_state, *others = publisher.frames(sample)
+                if args.obey:
+                    _hear_all(bus, course)
+                sample, (motor_state, *others) = course.step()
                 _send(bus, motor_state, publisher)
                 send_ns = time.monotonic_ns() - before_ns
                 for message in others:
@@ -113,6 +142,16 @@ def run_realtime(args) -> int:
     return 0
 
 
+def _hear_all(bus: can.BusABC, course: _Course) -> None:
+    """Everything that has arrived, and no more than a flood's worth of it."""
+    for _ in range(RX_MAX):
+        message = bus.recv(0.0)
+        if message is None:
+            return
+        if not (message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd):
+            course.hear(message.arbitration_id, bytes(message.data))
+
+
 def _send(bus: can.BusABC, message: can.Message, publisher: Publisher) -> None:
     for _ in range(TX_PATIENCE):
         try:
@@ -128,25 +167,29 @@ def _send(bus: can.BusABC, message: can.Message, publisher: Publisher) -> None:
 def run_lockstep(args, inp: BinaryIO, out: BinaryIO) -> int:
     """Advance by 0.1 s for each TICK record read, writing the frames of that time and echoing the TICK.
 
+    Frames before the TICK are what the other processes said; a plant that obeys hears them before it moves on.
     Time on the records starts at 0 with the first tick simulated here. Writes END after the last frame.
     """
     scenario = _scenario(args)
     plant = make_plant(scenario, args.seed)
     publisher = _publisher(scenario, plant)
+    course = _Course(plant, publisher, args.obey)
     ticks, first = round(scenario.duration_s * 100), plant.tick
     done = False
     while not done:
         try:
-            *_, mark = read_until_control(inp)
+            *heard, mark = read_until_control(inp)
         except EOFError:
             return 0
         if mark.data[0] == END:
             return 0
+        for record in heard:
+            course.hear(record.can_id, record.data)
         chunk = bytearray()
         for _ in range(TICKS_PER_INTERVAL):
-            sample = plant.step()
+            sample, messages = course.step()
             t_ns = (sample.tick - first) * TICK_NS
-            for message in publisher.frames(sample):
+            for message in messages:
                 chunk += pack(t_ns, message.arbitration_id, bytes(message.data))
             done = sample.done or (ticks > 0 and sample.tick - first >= ticks)
             if done:

@@ -2,6 +2,7 @@
 
 import can
 
+from plant_sim.obedience import FREE, Decision, Obedience
 from plant_sim.plant import PlantSample
 from rt_runner.codec import Encoder
 from rt_runner.dbc import Dbc
@@ -28,14 +29,16 @@ class Publisher:
         self.late_max_ms = 0.0
         self.tx_retries = 0
 
-    def frames(self, s: PlantSample) -> list[can.Message]:
-        """Frames due at this tick, in the order they are to be sent."""
+    def frames(
+        self, s: PlantSample, decision: Decision = FREE, obedience: Obedience | None = None
+    ) -> list[can.Message]:
+        """Frames due at this tick, in the order they are to be sent.
+
+        ``decision`` is how the step was taken; ``obedience`` makes it, where a controller is on the bus.
+        """
         tick = s.tick % 65536
-        out = [
-            self._encode(
-                "MotorState", {"torque_nm": s.torque_nm, "speed_rpm": s.speed_rpm, "derating_active": 0, "tick": tick}
-            )
-        ]
+        motor = {"torque_nm": s.torque_nm, "speed_rpm": s.speed_rpm, "derating_active": decision.derating, "tick": tick}
+        out = [self._encode("MotorState", motor)]
         first, self._first_tick = self._first_tick is None, self._first_tick or s.tick
         if s.tick % 10 == 0:
             out += [
@@ -51,6 +54,11 @@ class Publisher:
                 self._encode("TruthVehicle", {"v_true_mps": s.v_mps, "distance_m": s.x_m, "tick": tick}),
                 self._encode("TruthFault", {"fault_w": s.fault_w, "fault_r": s.fault_r, "tick": tick}),
             ]
+            if obedience is not None:
+                out.append(self._encode("VehicleState", {"v_mps": s.v_mps, "distance_m": s.x_m, "tick": tick}))
+        if obedience is not None and s.tick % 100 == 50:
+            counts = {k: getattr(obedience, k) for k in ("commands", "refused", "fallback_ticks")}
+            out.append(self._encode("PlantControl", {"obeys": decision.obeys, **counts}))
         if s.tick % 100 == 0:
             out.append(
                 self._encode(
