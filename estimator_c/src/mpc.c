@@ -8,6 +8,7 @@ static const double RPM_PER_RAD_S = 30.0 / 3.14159265358979323846;
 static const double ABOVE_V_MAX_MPS = 1.0;
 static const double NEAR_K = 15.0;        /* a temperature this far below its limit does not count in this iteration */
 static const double TORQUE_FLOOR_NM = 15.0; /* of the curvature's divisor */
+static const double SETTLED_NM = 0.3;     /* after a change below that the curvature is not computed anew */
 static const double ARMIJO = 1e-4;
 enum { HALVINGS_MAX = 8 };
 
@@ -95,7 +96,8 @@ void mpc_init(mpc_t *self, const mpc_setting_t *setting, const mpc_vehicle_t *ve
 void mpc_forget(mpc_t *self)
 {
     memset(self->multiplier, 0, sizeof self->multiplier);
-    self->warm = false;
+    memset(self->kink, 0, sizeof self->kink);
+    memset(self->qp.bound, 0, sizeof self->qp.bound);
 }
 
 /* Cost of interval k but for friction and change of torque, with its derivatives over v+ (first and second). */
@@ -258,6 +260,7 @@ static void linearise_heat(mpc_t *self, const mpc_problem_t *problem, const mpc_
         qp->e[r] = course->theta[node[r] + 1][channel[r]] - problem->limit[channel[r]];
         qp->rho_1[r] = self->dt_s[node[r]] * self->setting.slack;
         qp->rho_2[r] = self->dt_s[node[r]] * self->setting.slack_square;
+        qp->kink[r] = self->kink[channel[r]][node[r]];
     }
     for (int k = self->setting.intervals - 1; k >= 0; k--) {
         while (first > 0 && node[first - 1] >= k) {
@@ -286,11 +289,67 @@ static void linearise_heat(mpc_t *self, const mpc_problem_t *problem, const mpc_
     }
 }
 
-/* Copper loss is square in T: a temperature whose slope over T is a has about the curvature a / T. Weighed with the multipliers of
- * the last quadratic programme. */
-static void add_curvature(mpc_t *self, const mpc_course_t *course, const int node[], const int channel[])
+/* What the temperatures in force, each times its multiplier, ask of every step; returns the last interval that matters, -1: none. */
+static int weigh_back(mpc_t *self, const mpc_course_t *course)
+{
+    ocp_row_t all = {.theta = {0.0, 0.0}};
+    int last = -1;
+    for (int k = self->setting.intervals - 1; k >= 0; k--) {
+        for (int ch = 0; ch < 2; ch++) {
+            all.theta[ch] += self->multiplier[ch][k];
+            last = self->multiplier[ch][k] > 0.0 && last < 0 ? k : last;
+        }
+        for (int s = self->first[k + 1] - 1; last >= 0 && s >= self->first[k]; s--) {
+            ocp_kernel->pull_back_one(course->tape[s], course->memory[s], &all, &self->bar[s]);
+        }
+    }
+    return last;
+}
+
+/* Second derivatives of these temperatures over the torques, each speed held: what the torques do to each other through the net's
+ * memory included, what they do through the speed left out. (To take some sub-steps for all does not do: the contributions of
+ * neighbours differ in sign.) */
+static bool curvature(mpc_t *self, const mpc_course_t *course)
+{
+    const int last = weigh_back(self, course);
+    double of_torque[OCP_DIRECTIONS] = {0.0};
+    memset(&self->tangent, 0, sizeof self->tangent);
+    memset(self->curve, 0, sizeof self->curve);
+    for (int k = 0; k <= last; k++) {
+        of_torque[k] = 1.0;
+        for (int s = self->first[k]; s < self->first[k + 1]; s++) {
+            ocp_kernel->push(course->tape[s], course->memory[s], &self->bar[s], of_torque, &self->tangent, k + 1, self->curve);
+        }
+        of_torque[k] = 0.0;
+    }
+    return last >= 0;
+}
+
+/* Into the matrix; where that is not positive definite any more, the part that is sure to keep it so: copper loss being square in
+ * T, a temperature whose slope over T is a has about the curvature a / T. */
+static void add_curvature(mpc_t *self, const mpc_course_t *course, const int node[], const int channel[], bool anew)
 {
     ocp_qp_t *qp = &self->qp;
+    if (anew) {
+        self->curved = curvature(self, course);
+    }
+    if (!self->curved) {
+        return;
+    }
+    for (int i = 0; i < qp->n; i++) {
+        memcpy(qp->matrix[i], qp->h[i], sizeof qp->h[i]);
+    }
+    for (int i = 0; i < self->setting.intervals; i++) {
+        for (int j = i; j < self->setting.intervals; j++) {
+            qp->matrix[2 * i][2 * j] += self->curve[i][j];
+        }
+    }
+    _Alignas(64) double work[OCP_LD][OCP_LD];
+    memcpy(work, qp->matrix, sizeof work);
+    if (ocp_kernel->factor(work, qp->n)) {
+        memcpy(qp->h, qp->matrix, sizeof qp->h);
+        return;
+    }
     for (int r = 0; r < qp->rows; r++) {
         const double multiplier = self->multiplier[channel[r]][node[r]];
         for (int k = 0; k <= node[r] && multiplier > 0.0; k++) {
@@ -361,7 +420,7 @@ mpc_status_t mpc_solve(mpc_t *self, const mpc_problem_t *problem, mpc_result_t *
     const mpc_setting_t *set = &self->setting;
     int node[OCP_ROWS], channel[OCP_ROWS];
     bool converged = false;
-    result->iterations = result->qp_iterations = result->rolls = 0;
+    result->iterations = result->qp_iterations = result->sets = result->rolls = 0;
     result->kkt_nm = NAN;
     if (!finite_problem(self, problem)) {
         return MPC_FAILED;
@@ -380,19 +439,25 @@ mpc_status_t mpc_solve(mpc_t *self, const mpc_problem_t *problem, mpc_result_t *
         const mpc_course_t *now = &self->course[self->present];
         linearise_motion(self, problem, now);
         linearise_heat(self, problem, now, node, channel);
-        add_curvature(self, now, node, channel);
+        add_curvature(self, now, node, channel, !(result->kkt_nm < SETTLED_NM));
         const bool solved = ocp_qp_solve(&self->qp);
         result->iterations++;
         result->qp_iterations += self->qp.iterations;
+        result->sets += self->qp.sets;
         if (!solved) {
             return MPC_FAILED;
         }
+        const double before = result->kkt_nm;
         result->kkt_nm = largest_change(&self->qp);
         memset(self->multiplier, 0, sizeof self->multiplier);
+        memset(self->kink, 0, sizeof self->kink);
         for (int r = 0; r < self->qp.rows; r++) {
+            self->kink[channel[r]][node[r]] = self->qp.kink[r];
             self->multiplier[channel[r]][node[r]] = self->qp.multiplier[r];
         }
-        converged = result->kkt_nm <= set->tolerance_nm;
+        /* With this iteration's step taken, what the next one would change, if it shrinks as this one did. */
+        const double next_nm = result->iterations > 1 ? result->kkt_nm * (result->kkt_nm / before) : result->kkt_nm;
+        converged = lesser(next_nm, result->kkt_nm) <= set->tolerance_nm;
         double length = 1.0;
         for (int halvings = 0;; halvings++) {
             const mpc_course_t *next = &self->course[1 - self->present];
@@ -408,7 +473,6 @@ mpc_status_t mpc_solve(mpc_t *self, const mpc_problem_t *problem, mpc_result_t *
         }
         self->present = 1 - self->present;
     }
-    self->warm = true;
     report(self, result);
     const double sum = result->cost + result->kkt_nm + result->v_mps[set->intervals];
     return !(sum - sum == 0.0) ? MPC_FAILED : converged ? MPC_OK : MPC_MAX_ITERATIONS;

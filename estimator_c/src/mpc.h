@@ -57,7 +57,7 @@ typedef struct {
     double cost;
     double kkt_nm;                             /* largest change of torque of the last quadratic programme */
     double slack_k;                            /* largest excess of a temperature over its limit */
-    int32_t iterations, qp_iterations, rolls;  /* rolls: passes forward through the horizon */
+    int32_t iterations, qp_iterations, sets, rolls; /* of the quadratic programmes: interior points, active sets; rolls: passes forward through the horizon */
 } mpc_result_t;
 
 /* A course through the horizon: unknowns, states, and what their derivatives need. */
@@ -81,8 +81,8 @@ typedef struct {
     double scale;                              /* q_v */
     double dt_s[MPC_INTERVALS_MAX];
     int32_t first[MPC_INTERVALS_MAX + 1];      /* sub-step at which the interval begins */
-    bool warm;                                 /* multipliers of a solution before */
     double multiplier[2][MPC_INTERVALS_MAX];
+    uint8_t kink[2][MPC_INTERVALS_MAX];        /* ocp_kink_t of each temperature in the last quadratic programme */
     mpc_course_t course[2];                    /* present and tried */
     int32_t present;
 
@@ -91,6 +91,10 @@ typedef struct {
     _Alignas(64) double by_t[MPC_INTERVALS_MAX][OCP_LD];  /* of T in interval k */
     _Alignas(64) double change[MPC_INTERVALS_MAX][OCP_LD];/* of T - T before */
     ocp_row_t back[2 * MPC_INTERVALS_MAX];
+    ocp_bar_t bar[MPC_SUBSTEPS_MAX];           /* of the temperatures in force together */
+    ocp_tangent_t tangent;
+    bool curved;                               /* a temperature is in force: there is a curvature */
+    _Alignas(64) double curve[MPC_INTERVALS_MAX][OCP_DIRECTIONS]; /* of them, over the torques */
     ocp_qp_t qp;
 } mpc_t;
 

@@ -3,11 +3,13 @@
 #include <math.h>
 #include <string.h>
 
-enum { ITERATIONS_MAX = 40 };
+enum { ITERATIONS_MAX = 40, SETS_MAX = 8 };
 
 static const double GAP = 1e-11;      /* mean complementarity that is a solution */
 static const double RESIDUAL = 1e-8;  /* of stationarity */
 static const double GAP_POOR = 1e-6;  /* taken where rounding allows no more */
+static const double GAP_SETS = 1e-5;    /* from here on the active sets are worth a try */
+static const double WRONG = 1e-9;       /* a sign or a bound missed by more than that changes the set */
 static const double INSIDE = 0.05;    /* of the box, the start's distance from a bound */
 static const double SLACK_START = 0.1;
 
@@ -195,28 +197,192 @@ static double penalty(const ocp_qp_t *self, int k, double excess)
     return self->rho_1[k] * s + self->rho_2[k] * s * s;
 }
 
-static void conclude(ocp_qp_t *self, const point_t *at)
+/* The solution if the sets are right: d and the multipliers. False: not positive definite. */
+static bool solve_sets(ocp_qp_t *self, double d[], double multiplier[])
+{
+    _Alignas(64) double x[OCP_LD] = {0.0}, nu[OCP_LD] = {0.0};
+    double fixed[OCP_LD], by_h[OCP_LD], gap_row[OCP_ROWS];
+    int free[OCP_LD], on[OCP_ROWS], frees = 0, ons = 0;
+    for (int k = 0; k < self->n; k++) {
+        fixed[k] = self->bound[k] == OCP_LOW ? self->low[k] : self->bound[k] == OCP_HIGH ? self->high[k] : 0.0;
+        if (self->bound[k] == OCP_FREE) {
+            free[frees++] = k;
+        }
+    }
+    (void)product_with_h(self, fixed, by_h);
+    for (int i = 0; i < self->n; i++) {
+        by_h[i] += self->g[i];
+    }
+    for (int i = 0; i < frees; i++) {
+        memset(self->matrix[i], 0, sizeof self->matrix[i]);
+        for (int j = i; j < frees; j++) {
+            self->matrix[i][j] = self->h[free[i]][free[j]];
+        }
+    }
+    for (int r = 0; r < self->rows; r++) {
+        const double *a = self->a[r];
+        gap_row[r] = self->e[r] + dot(a, fixed, self->support[r]);
+        if (self->kink[r] == OCP_OFF) {
+            continue;
+        }
+        double *reach = self->reach[self->kink[r] == OCP_ON ? ons : OCP_ROWS - 1]; /* the last is free while a row is over */
+        memset(reach, 0, sizeof self->reach[0]);
+        for (int i = 0; i < frees && free[i] < self->support[r]; i++) {
+            reach[i] = a[free[i]];
+        }
+        if (self->kink[r] == OCP_ON) {
+            on[ons++] = r;
+            continue;
+        }
+        const double force = self->rho_1[r] + 2.0 * self->rho_2[r] * gap_row[r];
+        for (int j = 0; j < self->support[r]; j++) {
+            by_h[j] += force * a[j];
+        }
+        for (int i = 0; i < frees && free[i] < self->support[r]; i++) {
+            for (int j = i; j < frees; j++) {
+                self->matrix[i][j] += 2.0 * self->rho_2[r] * reach[i] * reach[j];
+            }
+        }
+    }
+    if (ons > frees || !ocp_kernel->factor(self->matrix, frees)) {
+        return false;
+    }
+    for (int i = 0; i < frees; i++) {
+        x[i] = -by_h[free[i]];
+    }
+    ocp_kernel->solve((const double (*)[OCP_LD])self->matrix, frees, x);
+    for (int p = 0; p < ons; p++) { /* reach_p := matrix^-1 a_p */
+        ocp_kernel->solve((const double (*)[OCP_LD])self->matrix, frees, self->reach[p]);
+        nu[p] = gap_row[on[p]];
+        memset(self->schur[p], 0, sizeof self->schur[p]);
+    }
+    for (int p = 0; p < ons; p++) {
+        for (int i = 0; i < frees && free[i] < self->support[on[p]]; i++) {
+            const double a = self->a[on[p]][free[i]];
+            nu[p] += a * x[i];
+            for (int q = p; q < ons; q++) {
+                self->schur[p][q] += a * self->reach[q][i];
+            }
+        }
+    }
+    if (!ocp_kernel->factor(self->schur, ons)) {
+        return false;
+    }
+    ocp_kernel->solve((const double (*)[OCP_LD])self->schur, ons, nu);
+    for (int p = 0; p < ons; p++) {
+        for (int i = 0; i < frees; i++) {
+            x[i] -= nu[p] * self->reach[p][i];
+        }
+    }
+    memcpy(d, fixed, sizeof(double) * (size_t)self->n);
+    for (int i = 0; i < frees; i++) {
+        d[free[i]] = x[i];
+    }
+    for (int r = 0, p = 0; r < self->rows; r++) {
+        const double excess = self->e[r] + dot(self->a[r], d, self->support[r]);
+        multiplier[r] = self->kink[r] == OCP_OFF ? 0.0
+                        : self->kink[r] == OCP_ON ? nu[p++]
+                                                  : self->rho_1[r] + 2.0 * self->rho_2[r] * excess;
+    }
+    return true;
+}
+
+/* Change all that the solution of the sets contradicts; returns how much that was, -1: something is not finite. */
+static int revise_sets(ocp_qp_t *self, const double d[], const double multiplier[])
+{
+    double residual[OCP_LD], sum = 0.0;
+    int wrong = 0;
+    sum += product_with_h(self, d, residual);
+    for (int k = 0; k < self->n; k++) {
+        residual[k] += self->g[k];
+    }
+    add_rows(self, multiplier, residual);
+    for (int k = 0; k < self->n; k++) {
+        const uint8_t was = self->bound[k];
+        if (was == OCP_FREE) {
+            self->bound[k] = d[k] < self->low[k] - WRONG ? OCP_LOW : d[k] > self->high[k] + WRONG ? OCP_HIGH : OCP_FREE;
+        } else if (was == OCP_LOW ? residual[k] < -WRONG : residual[k] > WRONG) {
+            self->bound[k] = OCP_FREE;
+        }
+        wrong += self->bound[k] != was;
+        sum += residual[k];
+    }
+    for (int r = 0; r < self->rows; r++) {
+        const uint8_t was = self->kink[r];
+        const double excess = self->e[r] + dot(self->a[r], d, self->support[r]);
+        if (was == OCP_ON) {
+            self->kink[r] = multiplier[r] < -WRONG ? OCP_OFF : multiplier[r] > self->rho_1[r] + WRONG ? OCP_OVER : OCP_ON;
+        } else if (was == OCP_OFF ? excess > WRONG : excess < -WRONG) {
+            self->kink[r] = OCP_ON;
+        }
+        wrong += self->kink[r] != was;
+        sum += excess;
+    }
+    return sum - sum == 0.0 ? wrong : -1;
+}
+
+static void conclude(ocp_qp_t *self, const double multiplier[])
 {
     double by_h[OCP_LD];
     self->decrease = -0.5 * product_with_h(self, self->d, by_h) - dot(self->g, self->d, self->n);
     for (int k = 0; k < self->rows; k++) {
         const double excess = self->e[k] + dot(self->a[k], self->d, self->support[k]);
         self->decrease += penalty(self, k, self->e[k]) - penalty(self, k, excess);
-        self->multiplier[k] = at->lambda[k];
+        self->multiplier[k] = multiplier[k];
     }
     for (int k = self->n; k < OCP_LD; k++) {
         self->d[k] = 0.0;
     }
 }
 
+/* By active sets, from the guess; whether it settled. */
+static bool settle(ocp_qp_t *self)
+{
+    double d[OCP_LD], multiplier[OCP_ROWS];
+    for (int k = 0; k < SETS_MAX; k++) {
+        self->sets++;
+        if (!solve_sets(self, d, multiplier)) {
+            return false;
+        }
+        const int wrong = revise_sets(self, d, multiplier);
+        if (wrong < 0) {
+            return false;
+        }
+        if (wrong == 0) {
+            for (int j = 0; j < self->n; j++) { /* rounding may have left the box */
+                self->d[j] = d[j] < self->low[j] ? self->low[j] : d[j] > self->high[j] ? self->high[j] : d[j];
+            }
+            conclude(self, multiplier);
+            return true;
+        }
+    }
+    return false;
+}
+
+/* The sets that an interior point is heading for. */
+static void guess_sets(ocp_qp_t *self, const point_t *at)
+{
+    for (int k = 0; k < self->n; k++) {
+        self->bound[k] = at->z_below[k] > at->below[k] ? OCP_LOW : at->z_above[k] > at->above[k] ? OCP_HIGH : OCP_FREE;
+    }
+    for (int k = 0; k < self->rows; k++) {
+        self->kink[k] = at->lambda[k] < at->t[k] ? OCP_OFF : at->mu[k] < at->s[k] ? OCP_OVER : OCP_ON;
+    }
+}
+
 bool ocp_qp_solve(ocp_qp_t *self)
 {
-    _Alignas(64) double residual[OCP_LD], d_step[OCP_LD] = {0.0};
+    _Alignas(64) double residual[OCP_LD], d_step[OCP_LD] = {0.0}, inside[OCP_LD];
     point_t at, tried, step;
     const int n = self->n;
     const point_t *const nowhere = &at; /* times a length of 0 */
+    bool tried_sets = false;
+    self->iterations = self->sets = 0;
+    if (settle(self)) {
+        return true;
+    }
     start(self, &at);
-    for (self->iterations = 0; self->iterations < ITERATIONS_MAX; self->iterations++) {
+    for (; self->iterations < ITERATIONS_MAX; self->iterations++) {
         double worst = 0.0;
         (void)product_with_h(self, self->d, residual);
         for (int k = 0; k < n; k++) {
@@ -230,8 +396,18 @@ bool ocp_qp_solve(ocp_qp_t *self)
         if (!(now - now == 0.0) || !(worst - worst == 0.0)) {
             return false;
         }
+        if (!tried_sets && now < GAP_SETS) {
+            memcpy(inside, self->d, sizeof inside);
+            guess_sets(self, &at);
+            if (settle(self)) {
+                return true;
+            }
+            memcpy(self->d, inside, sizeof inside);
+            tried_sets = true;
+        }
         if (now < GAP && worst < RESIDUAL) {
-            conclude(self, &at);
+            guess_sets(self, &at);
+            conclude(self, at.lambda);
             return true;
         }
         if (!factor(self, &at)) {
@@ -253,6 +429,7 @@ bool ocp_qp_solve(ocp_qp_t *self)
     if (!(gap(self, &at, nowhere, 0.0) < GAP_POOR)) {
         return false;
     }
-    conclude(self, &at);
+    guess_sets(self, &at);
+    conclude(self, at.lambda);
     return true;
 }

@@ -72,7 +72,8 @@ class Result(ct.Structure):
     _fields_ = (
         ("torque_nm", f64 * INTERVALS), ("friction_nm", f64 * INTERVALS), ("v_mps", f64 * (INTERVALS + 1)),
         ("theta", (f64 * 2) * (INTERVALS + 1)), ("multiplier", (f64 * 2) * INTERVALS), ("cost", f64), ("kkt_nm", f64),
-        ("slack_k", f64), ("iterations", ct.c_int32), ("qp_iterations", ct.c_int32), ("rolls", ct.c_int32),
+        ("slack_k", f64), ("iterations", ct.c_int32), ("qp_iterations", ct.c_int32), ("sets", ct.c_int32),
+        ("rolls", ct.c_int32),
     )  # fmt: skip
 
 

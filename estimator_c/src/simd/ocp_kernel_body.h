@@ -64,6 +64,143 @@ static void pull_back(const double tape[], const double memory[], ocp_row_t row[
     }
 }
 
+static void pull_back_one(const double tape[], const double memory[], ocp_row_t *row, ocp_bar_t *bar)
+{
+    for (int c = 0; c < H; c++) {
+        const double of_rates = NET_DT_S * (row->theta[0] * ocp_out[0][c] + row->theta[1] * ocp_out[1][c]);
+        bar->c[c] = row->c[c];
+        bar->h[c] = row->h[c] + of_rates;
+    }
+    pull_back(tape, memory, row, 1);
+}
+
+/* The step's derivatives of one cell, numbers that all directions share. */
+typedef struct {
+    double i, f, g;                /* new c by the gates' arguments */
+    double o_h, c_h;               /* new h by o's argument and by new c */
+    double keep;                   /* new c by c */
+    double ii, ig, gg, ff, fc, oo, oc, cc; /* second derivatives of what is asked for */
+} cell_t;
+
+static void differentiate(const double tape[], const double memory[], const ocp_bar_t *bar, cell_t cell[])
+{
+    for (int k = 0; k < H; k++) {
+        const double i = tape[k], f = tape[H + k], g = tape[2 * H + k], o = tape[3 * H + k], t = tape[4 * H + k];
+        const double di = i * (1.0 - i), df = f * (1.0 - f), dg = 1.0 - g * g, d_o = o * (1.0 - o), dt = 1.0 - t * t;
+        const double h_bar = bar->h[k];
+        const double c_bar = bar->c[k] + h_bar * o * dt;
+        cell[k] = (cell_t){
+            .i = g * di, .f = memory[k] * df, .g = i * dg, .o_h = t * d_o, .c_h = o * dt, .keep = f,
+            .ii = c_bar * g * di * (1.0 - 2.0 * i), .ig = c_bar * di * dg, .gg = c_bar * i * dg * (-2.0 * g),
+            .ff = c_bar * memory[k] * df * (1.0 - 2.0 * f), .fc = c_bar * df,
+            .oo = h_bar * t * d_o * (1.0 - 2.0 * o), .oc = h_bar * d_o * dt, .cc = h_bar * o * dt * (-2.0 * t),
+        };
+    }
+}
+
+enum { PAD = 8, TILE = 4, FORMS = 6 * H }; /* rows of a quadratic form: arguments of i, g, f, o, then c and new c, of each cell */
+
+/* TILE rows of curve, `vectors` (1 or 2) vectors wide, in registers while all forms pass. */
+static inline __attribute__((always_inline)) void add_tile(const double left[][OCP_DIRECTIONS],
+                                                           const double right[][OCP_DIRECTIONS], int a, int b, int vectors,
+                                                           double curve[][OCP_DIRECTIONS])
+{
+    vec_t sum[TILE][2];
+#pragma GCC unroll 4
+    for (int k = 0; k < TILE; k++) {
+#pragma GCC unroll 2
+        for (int c = 0; c < vectors; c++) {
+            sum[k][c] = vec_load(&curve[a + k][b + c * WIDTH]);
+        }
+    }
+    for (int r = 0; r < FORMS; r++) {
+#pragma GCC unroll 4
+        for (int k = 0; k < TILE; k++) {
+            const vec_t scale = vec_all(left[r][a + k]);
+#pragma GCC unroll 2
+            for (int c = 0; c < vectors; c++) {
+                sum[k][c] = vec_fma(scale, vec_load(&right[r][b + c * WIDTH]), sum[k][c]);
+            }
+        }
+    }
+#pragma GCC unroll 4
+    for (int k = 0; k < TILE; k++) {
+#pragma GCC unroll 2
+        for (int c = 0; c < vectors; c++) {
+            vec_store(&curve[a + k][b + c * WIDTH], sum[k][c]);
+        }
+    }
+}
+
+static void push(const double tape[], const double memory[], const ocp_bar_t *bar, const double of_torque[],
+                 ocp_tangent_t *tangent, int directions, double curve[][OCP_DIRECTIONS])
+{
+    _Alignas(64) double left[FORMS][OCP_DIRECTIONS], right[FORMS][OCP_DIRECTIONS];
+    cell_t cell[H];
+    const int padded = (directions + PAD - 1) / PAD * PAD;
+    differentiate(tape, memory, bar, cell);
+    for (int d = 0; d < padded; d += WIDTH) {
+        vec_t h[H], theta[2], torque = vec_load(&of_torque[d]);
+        vec_t rate[2] = {vec_all(0.0), vec_all(0.0)};
+#pragma GCC unroll 8
+        for (int k = 0; k < H; k++) {
+            h[k] = vec_load(&tangent->h[k][d]);
+        }
+        for (int ch = 0; ch < 2; ch++) {
+            theta[ch] = vec_load(&tangent->theta[ch][d]);
+        }
+        for (int k = 0; k < H; k++) {
+            vec_t z[4];
+#pragma GCC unroll 4
+            for (int g = 0; g < 4; g++) {
+                const double *row = ocp_back[g * OCP_PAD + k];
+                vec_t sum = vec_mul(vec_all(row[H + 1]), torque);
+                vec_t other = vec_mul(vec_all(row[H + 2]), theta[0]);
+                other = vec_fma(vec_all(row[H + 3]), theta[1], other);
+#pragma GCC unroll 8
+                for (int j = 0; j < H; j += 2) {
+                    sum = vec_fma(vec_all(row[j]), h[j], sum);
+                    other = vec_fma(vec_all(row[j + 1]), h[j + 1], other);
+                }
+                z[g] = vec_add(sum, other);
+            }
+            const cell_t *at = &cell[k];
+            const vec_t c = vec_load(&tangent->c[k][d]);
+            vec_t next = vec_mul(vec_all(at->keep), c);
+            next = vec_fma(vec_all(at->i), z[0], next);
+            next = vec_fma(vec_all(at->f), z[1], next);
+            next = vec_fma(vec_all(at->g), z[2], next);
+            const vec_t out = vec_fma(vec_all(at->c_h), next, vec_mul(vec_all(at->o_h), z[3]));
+            vec_store(&tangent->c[k][d], next);
+            vec_store(&tangent->h[k][d], out);
+            rate[0] = vec_fma(vec_all(ocp_out[0][k]), out, rate[0]);
+            rate[1] = vec_fma(vec_all(ocp_out[1][k]), out, rate[1]);
+            const vec_t pair[6] = {z[0], z[2], z[1], c, z[3], next};
+            const double form[3][3] = {{at->ii, at->ig, at->gg}, {at->ff, at->fc, 0.0}, {at->oo, at->oc, at->cc}};
+#pragma GCC unroll 3
+            for (int p = 0; p < 3; p++) {
+                const vec_t a = pair[2 * p], b = pair[2 * p + 1], cross = vec_all(form[p][1]);
+                vec_store(&left[6 * k + 2 * p][d], a);
+                vec_store(&left[6 * k + 2 * p + 1][d], b);
+                vec_store(&right[6 * k + 2 * p][d], vec_fma(vec_all(form[p][0]), a, vec_mul(cross, b)));
+                vec_store(&right[6 * k + 2 * p + 1][d], vec_fma(cross, a, vec_mul(vec_all(form[p][2]), b)));
+            }
+        }
+        for (int ch = 0; ch < 2; ch++) {
+            vec_store(&tangent->theta[ch][d], vec_fma(vec_all(NET_DT_S), rate[ch], theta[ch]));
+        }
+    }
+    for (int a = 0; a < padded; a += TILE) {
+        int b = a - a % PAD;
+        for (; b + 2 * WIDTH <= padded; b += 2 * WIDTH) {
+            add_tile((const double (*)[OCP_DIRECTIONS])left, (const double (*)[OCP_DIRECTIONS])right, a, b, 2, curve);
+        }
+        for (; b < padded; b += WIDTH) {
+            add_tile((const double (*)[OCP_DIRECTIONS])left, (const double (*)[OCP_DIRECTIONS])right, a, b, 1, curve);
+        }
+    }
+}
+
 /* to[j] += sum of sign scale[k] row_k[j] for j >= from; GROUP vectors at a time stay in registers. */
 static inline void add_rows(double to[], int from, int n, const double row[][OCP_LD], const double scale[], int first, int last)
 {
@@ -168,6 +305,8 @@ const ocp_kernel_t OCP_KERNEL = {
     .name = OCP_KERNEL_NAME,
     .available = vec_available,
     .pull_back = pull_back,
+    .pull_back_one = pull_back_one,
+    .push = push,
     .gram = gram,
     .factor = factor,
     .solve = solve,
