@@ -9,7 +9,7 @@ import sys
 
 from rt_runner.errors import RtError
 
-VERBS = ("run", "mil", "inspect", "timing", "report", "dataset", "train", "evaluate", "compare", "bench", "vcan")
+VERBS = ("run", "mil", "inspect", "timing", "report", "replay", "dataset", "train", "evaluate", "compare", "bench", "vcan")
 
 
 class _Parser(argparse.ArgumentParser):
