@@ -9,7 +9,9 @@ import sys
 
 from rt_runner.errors import RtError
 
-VERBS = ("run", "mil", "inspect", "timing", "report", "replay", "dataset", "train", "evaluate", "compare", "bench", "vcan")
+VERBS = (
+    "run", "mil", "inspect", "timing", "report", "replay", "dataset", "train", "evaluate", "compare", "bench", "vcan"
+)  # fmt: skip
 
 
 class _Parser(argparse.ArgumentParser):

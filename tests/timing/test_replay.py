@@ -83,7 +83,7 @@ def test_every_estimate_comes_out_again(kind, request):
     assert figures["frames"] >= 5 * figures["estimates"] + figures["estimates"] * figures["period_s"] * 0.8
     assert figures["lockstep"] is (kind == "stepped")
     faults = {f.values["sensor_w_fault"] for f in LogReader(log.path).frames({"EstWinding"})}
-    assert len(faults) == (2 if kind == "real" else 1), "the fault was noticed in between"
+    assert (len(faults) > 1) is (kind == "real"), "the fault was noticed in between"
     assert all(i["same"] for i in figures["identity"].values())
     assert "verdict: identical" in done.stdout
 
