@@ -8,7 +8,7 @@ A frame that is missing and that nobody counted as dropped breaks the books: the
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -97,11 +97,8 @@ class Audit:
 
 def audit(books: Books) -> Audit:
     """Make all checks."""
-    releases = {i: r for name, p in books.jobs.position.items() for r, i in _where(books, name, p)}
-    missing = [
-        m if (m.message, m.t_ns) not in releases else Missing(**{**vars(m), "release": releases[m.message, m.t_ns]})
-        for m in missing_frames(books.log.columns.values(), books.from_start)
-    ]
+    found = missing_frames(books.log.columns.values(), books.from_start)
+    missing = [replace(m, release=_release(books.jobs, m)) for m in found]
     drops = _drops(books)
     checks = [
         _file(books),
@@ -117,10 +114,13 @@ def audit(books: Books) -> Audit:
     return Audit(checks, missing, drops)
 
 
-def _where(books: Books, name: str, places) -> Iterator[tuple[int, tuple[str, int]]]:
-    """Release of every frame of a per-job message, by its stamp."""
-    stamps = books.log[name].t_ns
-    return ((r, (name, stamps[i])) for r, i in zip(books.jobs.release, places, strict=True) if i >= 0 and r >= 0)
+def _release(jobs: Jobs, missing: Missing) -> int | None:
+    """Release of the job that the frame before belongs to."""
+    places = jobs.position.get(missing.message)
+    if places is None or missing.place not in places:
+        return None
+    release = jobs.release[places.index(missing.place)]
+    return release if release >= 0 else None
 
 
 def _drops(books: Books) -> dict[str, int]:
@@ -182,9 +182,9 @@ def _conservation(books: Books) -> Iterator[Check]:
         total, jobs, skipped = (int(final[k]) for k in ("releases", "jobs", "miss_skipped"))
         wait = total - jobs - skipped
         says = f"{total} releases = {jobs} executed + {skipped} skipped + {wait} waiting"
-        yield Check("releases", 0 <= wait <= books.queue, f"{says}, and in {rounds} rounds of counters")
+        yield Check("releases", 0 <= wait <= books.queue, f"{says}, and in each round of counters ({rounds})")
     elif rounds:
-        yield Check("releases", True, f"releases = executed + skipped in {rounds} rounds of counters")
+        yield Check("releases", True, f"releases = executed + skipped in each round of counters ({rounds})")
     else:
         yield Check("releases", None, "no counters of the process in the log")
 

@@ -2,6 +2,7 @@
 
 from array import array
 from collections.abc import Callable, Iterator, Mapping
+from itertools import compress
 from typing import Any
 
 from rt_runner.timing.jobs import NO_NS, Jobs
@@ -61,9 +62,15 @@ def summaries(jobs: Jobs, more: Mapping[str, Any], period_ns: int) -> dict[str, 
     columns = {**{k: v for k, v in jobs.times.items() if k != "period_dev_abs"}, **more}
     out: dict[str, dict[str, Summary]] = {}
     for window in WINDOWS:
-        inside = list(window_of(jobs, window, period_ns))
-        out[window] = {}
-        for name, values in columns.items():
-            picked = [i for i, (v, w) in enumerate(zip(values, inside, strict=True)) if w and v != NO_NS]
-            out[window][name] = summarise([values[i] for i in picked], (jobs.release[i] for i in picked))
+        inside = bytearray(window_of(jobs, window, period_ns))
+        at = list(compress(jobs.release, inside))
+        out[window] = {name: _summary(list(compress(values, inside)), at) for name, values in columns.items()}
     return out
+
+
+def _summary(values: list[int], releases: list[int]) -> Summary:
+    """Of the values that are available."""
+    if NO_NS not in values:
+        return summarise(values, releases)
+    known = [v != NO_NS for v in values]
+    return summarise(list(compress(values, known)), list(compress(releases, known)))

@@ -22,6 +22,7 @@ class Missing:
     count: int
     t_ns: int
     release: int | None = None
+    place: int = 0  # of the frame before, in its column
 
     def text(self) -> str:
         """One line for people."""
@@ -67,7 +68,9 @@ def _gaps(column: Column, from_start: bool) -> list[Missing]:
                 count -= damaged
             if count:
                 after = None if last_i < 0 else last
-                found.append(Missing(column.name, column.sender, after, count, column.t_ns[max(last_i, 0)]))
+                found.append(
+                    Missing(column.name, column.sender, after, count, column.t_ns[max(last_i, 0)], None, max(last_i, 0))
+                )
         if column.e2e[i] != E2eStatus.REPEATED:
             damaged = 0
         last, last_i = counter, i

@@ -1,7 +1,7 @@
 """Summary of a duration: exact arithmetic on integer nanoseconds, percentiles by nearest rank."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,14 +52,13 @@ class Summary:
         return out
 
 
-def summarise(values_ns: Sequence[int], releases: Iterable[int]) -> Summary:
+def summarise(values_ns: Sequence[int], releases: Sequence[int]) -> Summary:
     """Summary of integer values and the releases they belong to, one each."""
     n = len(values_ns)
     if n == 0:
         return Summary()
     ordered = sorted(values_ns)
     low, high = ordered[0], ordered[-1]
-    at = list(releases)
     total = sum(ordered)
     squares = sum(v * v for v in ordered)
     # Integers all the way: no rounding until the very end, whatever the magnitudes.
@@ -67,9 +66,9 @@ def summarise(values_ns: Sequence[int], releases: Iterable[int]) -> Summary:
     return Summary(
         count=n,
         min_ns=low,
-        min_release=at[values_ns.index(low)],
+        min_release=releases[values_ns.index(low)],
         max_ns=high,
-        max_release=at[values_ns.index(high)],
+        max_release=releases[values_ns.index(high)],
         mean_ns=total / n,
         std_ns=None if variance is None else math.sqrt(variance),
         percentile_ns=tuple(nearest_rank(ordered, p) for p in PERCENTILES.values()),

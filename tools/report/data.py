@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rt_runner.timing.analyse import TimingReport
+
 Array = NDArray[np.float64]
 EMPTY: Array = np.empty(0)
 
@@ -68,7 +70,8 @@ class Jobs:
 class FrameStat:
     """One id on the bus. Gaps are times between consecutive receptions, in ms, None with fewer than two frames.
 
-    `cycle_ms` is that of the DBC; of frames sent once per job it is the estimator's period.
+    `cycle_ms` is that of the DBC; of frames sent once per job it is the estimator's period. `jitter_ms` is the standard
+    deviation of the gaps, `missing` the cycles without a frame, `timeouts` the silences longer than a receiver waits.
     """
 
     can_id: int
@@ -81,6 +84,9 @@ class FrameStat:
     gap_min_ms: float | None
     gap_max_ms: float | None
     timed_out: bool
+    jitter_ms: float | None
+    missing: int | None
+    timeouts: int | None
     counter_gaps: int
     repeats: int
     crc_errors: int
@@ -124,3 +130,4 @@ class ReportData:
     identity: tuple[tuple[str, str], ...] = ()
     environment: tuple[tuple[str, str], ...] = ()
     notices: tuple[str, ...] = ()
+    timing: TimingReport | None = None  # None: no real-time process in the log

@@ -9,7 +9,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from tools.report import tables
+from rt_runner.timing.figures import as_json
+from tools.report import deadline, tables
 from tools.report.charts import build_charts, time_range
 from tools.report.data import ReportData
 
@@ -29,6 +30,7 @@ def figures(data: ReportData) -> dict[str, Any]:
         "frames": [asdict(f) for f in data.frames],
         "identity": dict(data.identity),
         "environment": dict(data.environment),
+        "timing": None if data.timing is None else as_json(data.timing),
     }
 
 
@@ -54,6 +56,7 @@ def build_page(data: ReportData) -> str:
             by_id["drive"],
             by_id["response"],
             by_id["histogram"],
+            deadline.section(data.timing),
             tables.frames_table(data.frames),
             tables.identity(data),
             "<footer>charts drawn with uPlot (MIT, © Leon Sorokin) · this file loads nothing from a network</footer>",

@@ -13,8 +13,9 @@ from typing import Any
 
 from rt_runner.judge import Finding, overall
 from rt_runner.log_summary import MessageSummary, result_of
-from rt_runner.mcap_log import LogReader, LogSummary, summarise
+from rt_runner.mcap_log import LogError, LogReader, LogSummary, summarise
 from rt_runner.result import TICK_S, ResultAccumulator, RunFacts
+from rt_runner.timing.analyse import TimingReport, analyse
 from tools.report.collect import KEPT_LAST, WANTED, Collector, signals_of
 from tools.report.data import FrameStat, ReportData
 from tools.report.provenance import environment, identity
@@ -47,6 +48,7 @@ def read_report(path: Path) -> ReportData:
             collector.feed(*frame)
             judge.feed(*frame)
         result = finite(_judged(judge.result(_facts(reader, run, scenario, collector.last, lockstep)))) or {}
+    timing = _timing(path)
     signals = signals_of(collector.columns(), lockstep)
     return ReportData(
         source=path.name,
@@ -64,11 +66,12 @@ def read_report(path: Path) -> ReportData:
         speed=signals.speed,
         jobs=signals.jobs,
         period_s=_period_s(run, result),
-        frames=tuple(sorted((_frame_stat(m) for m in summary.messages), key=lambda f: f.can_id)),
+        frames=tuple(sorted((_frame_stat(m, timing) for m in summary.messages), key=lambda f: f.can_id)),
         spans=signals.spans,
         identity=identity(reader, run, collector.last),
         environment=environment(run, result, summary),
         notices=_notices(summary, from_log, result, bool(signals.winding.truth or signals.rotor.truth)),
+        timing=timing,
     )
 
 
@@ -158,7 +161,16 @@ def _started(path: Path, summary: LogSummary, lockstep: bool) -> str:
     return f"{datetime.fromtimestamp(summary.start_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
-def _frame_stat(m: MessageSummary) -> FrameStat:
+def _timing(path: Path) -> TimingReport | None:
+    """What is said of deadlines, None where the log has no real-time process."""
+    try:
+        return analyse(path)
+    except LogError:
+        return None
+
+
+def _frame_stat(m: MessageSummary, timing: TimingReport | None) -> FrameStat:
+    cycle = next((r for r in timing.cycles if r.name == m.name), None) if timing is not None else None
     return FrameStat(
         can_id=int(m.can_id, 16),
         name=m.name,
@@ -170,6 +182,9 @@ def _frame_stat(m: MessageSummary) -> FrameStat:
         gap_min_ms=m.min_ms,
         gap_max_ms=m.max_ms,
         timed_out=m.timed_out,
+        jitter_ms=cycle.std_ms if cycle else None,
+        missing=cycle.missing if cycle else None,
+        timeouts=cycle.timeouts if cycle else None,
         counter_gaps=m.counter_gaps,
         repeats=m.repeated,
         crc_errors=m.wrong_crc,

@@ -155,21 +155,25 @@ def frames_table(frames: tuple[FrameStat, ...]) -> str:
             f'<td class="n{" hot" if f.rate_ok is False else ""}">{number(f.rate_hz, 2)}</td>'
             f'<td class="n">{number(f.gap_min_ms, 2)}</td>'
             f'<td class="n{" hot" if f.timed_out else ""}">{number(f.gap_max_ms, 2)}</td>'
+            f'<td class="n">{number(f.jitter_ms, 3)}</td>'
+            f"{_count(f.missing, hot=False)}{_count(f.timeouts)}"
             f"{_count(f.counter_gaps)}{_count(f.repeats)}{_count(f.crc_errors)}</tr>"
         )
-    return f"""<section class="panel frames"><h2>Frames on the bus</h2><div class="scroll"><table>
+    return f"""<section class="panel frames"><h2>Frames on the bus, against the DBC</h2><div class="scroll"><table>
 <thead><tr><th>id</th><th>message</th><th>sender</th>
 <th class="n">cycle<small>DBC, ms</small></th><th class="n">frames</th>
 <th class="n">rate<small>Hz</small></th><th class="n">min gap<small>ms</small></th>
-<th class="n">max gap<small>ms</small></th>
+<th class="n">max gap<small>ms</small></th><th class="n">jitter<small>std, ms</small></th>
+<th class="n">missing<small>cycles</small></th><th class="n">timeouts</th>
 <th class="n">counter gaps</th><th class="n">E2E repeats</th><th class="n">E2E CRC</th></tr></thead>
 <tbody>{"".join(rows)}</tbody></table></div>
-<p class="note">gaps between receptions by the logger; the cycle of frames sent once per job is the loop's period;
-red: rate more than 5 % off the cycle, silence beyond the DBC timeout, or an end-to-end (E2E) fault</p></section>"""
+<p class="note">gaps between receptions by the logger, jitter their standard deviation; the cycle of frames sent once
+per job is the loop's period, where skipped releases are missing cycles; red: rate more than 5 % off the cycle,
+silence beyond the DBC timeout, or an end-to-end (E2E) fault</p></section>"""
 
 
-def _count(value: int) -> str:
-    return f'<td class="n{" hot" if value else ""}">{number(value)}</td>'
+def _count(value: int | None, hot: bool = True) -> str:
+    return f'<td class="n{" hot" if value and hot else ""}">{number(value)}</td>'
 
 
 def identity(data: ReportData) -> str:
