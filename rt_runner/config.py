@@ -57,6 +57,24 @@ class EstimatorConfig:
     period_s: float = 0.1
 
 
+CONTROLLERS = ("none", "rule-150-155", "rule-145-160", "mpc-S", "mpc-M", "paper")
+NO_CONTROLLER = "off"
+CONTROLLER_PERIODS_S = (0.01, 0.02, 0.05, 0.1)
+
+
+@dataclass(frozen=True)
+class ControllerConfig:
+    """Which controller commands the torque, and the period of its loop; "off": the plant's own driver, no process."""
+
+    name: str = NO_CONTROLLER
+    period_s: float = 0.1
+
+    @property
+    def present(self) -> bool:
+        """Whether there is one."""
+        return self.name != NO_CONTROLLER
+
+
 @dataclass(frozen=True)
 class Scenario:
     """One scenario, checked. ``name`` is what the user typed, ``path`` the file it came from.
@@ -73,6 +91,7 @@ class Scenario:
     cycle: CycleConfig = field(default_factory=CycleConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
+    controller: ControllerConfig = field(default_factory=ControllerConfig)
     limits: Limits = field(default_factory=Limits)
     plant: PlantConfig = field(default_factory=PlantConfig)
     faults: tuple[str, ...] = ()
@@ -123,6 +142,7 @@ def _build(tree: dict, name: str, path: Path, raw: bytes) -> Scenario:
         "plant": PlantConfig,
         "sensor": SensorConfig,
         "estimator": EstimatorConfig,
+        "controller": ControllerConfig,
         "limits": Limits,
     }
     values: dict = {"name": name, "path": path, "sha256": hashlib.sha256(raw).hexdigest()}
@@ -148,9 +168,8 @@ def _table(cls, values: dict, where: str):
     for key in values:
         if key not in known:
             raise UsageError(f"{where}: unknown key '{key}' (known: {', '.join(known)})")
-    return cls(
-        **{k: _typed(v, str if k in ("kind", "path", "setting") else float, f"{where} {k}") for k, v in values.items()}
-    )
+    texts = ("kind", "path", "setting", "name")
+    return cls(**{k: _typed(v, str if k in texts else float, f"{where} {k}") for k, v in values.items()})
 
 
 def _typed(value, want: type, where: str):
@@ -189,6 +208,7 @@ def _check(s: Scenario) -> None:
     if not (0 <= s.sensor.variance < math.inf and 0 <= s.sensor.delay_s <= 10 and abs(s.sensor.offset_degc) <= 100):
         refuse("[sensor] needs variance >= 0, delay_s in 0 … 10, |offset_degc| <= 100")
     check_period(s.estimator.period_s, f"scenario {s.path}: [estimator] period_s")
+    check_controller(s, f"scenario {s.path}: [controller]")
     if not (0 < s.limits.miss_rate_max < 1):
         refuse("[limits] miss_rate_max must lie between 0 and 1")
     if not (s.limits.theta_w_rmse_max_degc > 0 and s.limits.theta_r_rmse_max_degc > 0):
@@ -200,6 +220,18 @@ def check_period(period_s: float, what: str) -> None:
     us = period_s * 1e6
     if not (1000 <= us <= 1_000_000) or abs(us - round(us)) > 1e-6:
         raise UsageError(f"{what} = {period_s:g}: must be 0.001 … 1 s in whole microseconds")
+
+
+def check_controller(s: Scenario, what: str) -> None:
+    """Refuse a controller that is none of ours, one at a period it does not know, or one on a road over time."""
+    c = s.controller
+    if c.name not in (NO_CONTROLLER, *CONTROLLERS):
+        raise UsageError(f"{what}: '{c.name}' is none of {', '.join((NO_CONTROLLER, *CONTROLLERS))}")
+    if c.period_s not in CONTROLLER_PERIODS_S:
+        known = ", ".join(f"{p:g}" for p in CONTROLLER_PERIODS_S)
+        raise UsageError(f"{what}: period_s = {c.period_s:g} is none of {known}")
+    if c.present and s.cycle.kind == "class3":
+        raise UsageError(f"{what}: a controller looks ahead by distance, and class3 is a cycle over time; drive a lap")
 
 
 def with_duration(s: Scenario, duration_s: float | None) -> Scenario:

@@ -1,4 +1,8 @@
-"""Lock-step: this process carries the frames between plant and estimator, so no clock is needed and none is read."""
+"""Lock-step: this process carries the frames between the others, so no clock is needed and none is read.
+
+Each 0.1 s in this order: the plant moves on, the estimator's jobs, the controller's jobs; what those two said is what
+the plant hears before it moves on. Who commands acts on the newest state there is, from the next interval on.
+"""
 
 import contextlib
 import json
@@ -10,6 +14,7 @@ from pathlib import Path
 from rt_runner import paths
 from rt_runner.children import spawn
 from rt_runner.config import Scenario
+from rt_runner.controller import controller_command, preview
 from rt_runner.dbc import Dbc
 from rt_runner.errors import RtError, SetupError
 from rt_runner.mcap_log import LogError, LogWriter
@@ -84,12 +89,13 @@ def run_lockstep(
     SetupError
         The plant refused the scenario (there is no log then), or the log cannot be written on.
     """
-    e = scenario.estimator
+    e, c = scenario.estimator, scenario.controller
     plant_command = [sys.executable, "-m", "plant_sim", "--lockstep", "--scenario", str(scenario.path)]
     plant_command += ["--seed", str(seed)]
     if scenario.duration_s:
         plant_command += ["--duration", str(scenario.duration_s)]
     plant_command += [f"--fault={fault}" for fault in scenario.added_faults]
+    plant_command += ["--obey"] if c.present else []
     estimator_command = [str(paths.binary("rt_estimator")), "--lockstep", "--no-rt", "--setting", e.setting]
     estimator_command += ["--period-us", str(round(e.period_s * 1e6))]
     facts = RunFacts(
@@ -103,10 +109,14 @@ def run_lockstep(
     )
     accumulator = ResultAccumulator()
     peers: list[_Peer] = []
-    try:
-        for name, command in (("plant", plant_command), ("estimator", estimator_command)):
-            peers.append(_Peer(name, command))
-        plant, estimator = peers
+    with contextlib.ExitStack() as stack:
+        stack.callback(lambda: [peer.close() for peer in peers])
+        commands = {"plant": plant_command, "estimator": estimator_command}
+        if c.present:
+            road = stack.enter_context(preview(scenario))
+            commands["controller"] = controller_command(c, road, ["--lockstep", "--no-rt"])
+        peers += [_Peer(name, command) for name, command in commands.items()]
+        plant, estimator, *others = peers
         try:
             first = plant.exchange(control(0, TICK))
         except RtError as error:
@@ -115,7 +125,7 @@ def run_lockstep(
         attachments = {**provenance.files, **{k: v.encode() for k, v in provenance.texts.items()}}
         with LogWriter(log, dbc, provenance.run, attachments) as writer:
             try:
-                _shuttle(first, plant, estimator, writer, accumulator, progress)
+                _shuttle(first, plant, [estimator, *others], writer, accumulator, progress)
             except LogError:
                 raise
             except RtError as error:
@@ -125,16 +135,13 @@ def run_lockstep(
             facts = replace(facts, granted=granted)
             result = accumulator.result(facts)
             writer.seal(asdict(facts), result)
-    finally:
-        for peer in peers:
-            peer.close()
     return result
 
 
 def _shuttle(
     answer: list[Record],
     plant: _Peer,
-    estimator: _Peer,
+    workers: list[_Peer],
     writer: LogWriter,
     accumulator: ResultAccumulator,
     progress: Callable[[dict], None],
@@ -153,11 +160,18 @@ def _shuttle(
     while True:
         t_ns, code = answer[-1].t_ns, answer[-1].data[0]
         take(answer)
-        take(estimator.exchange(b"".join(pack(*r) for r in answer[:-1]) + control(t_ns, TICK)))
+        heard, said = list(answer[:-1]), []
+        for worker in workers:  # each hears the plant, and those before it
+            words = worker.exchange(b"".join(pack(*r) for r in heard) + control(t_ns, TICK))
+            take(words)
+            heard += words[:-1]
+            said += words[:-1]
         if t_ns % PROGRESS_NS == 0:
             shown = {k: newest.get(k) for k in ("theta_w_est_degc", "theta_w_true_degc")}
             progress({"t_s": t_ns / 1e9, "frames": writer.frames, **shown})
         if code == END:
             break
-        answer = plant.exchange(control(t_ns, TICK))
-    take(estimator.exchange(control(t_ns, END)))
+        for_plant = b"".join(pack(*r) for r in said) if len(workers) > 1 else b""
+        answer = plant.exchange(for_plant + control(t_ns, TICK))
+    for worker in workers:
+        take(worker.exchange(control(t_ns, END)))

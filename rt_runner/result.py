@@ -53,6 +53,7 @@ class RunFacts:
     log_dropped: int = 0  # frames the kernel or the hub dropped before the logger saw them
     log_cut_short: bool = False  # the logger could not take all that had arrived
     faults: tuple[str, ...] = ()  # of the sensors, as text
+    restarts: tuple[str, ...] = ()  # how processes ended that were then started again
 
     @staticmethod
     def from_dict(values: dict) -> "RunFacts":
@@ -63,6 +64,7 @@ class RunFacts:
             names = {f.name for f in fields(Limits)}
             kept["limits"] = Limits(**{k: v for k, v in kept["limits"].items() if k in names})
         kept["faults"] = tuple(kept.get("faults") or ())
+        kept["restarts"] = tuple(kept.get("restarts") or ())
         return RunFacts(**kept)
 
 
@@ -342,6 +344,8 @@ class ResultAccumulator:
     def _judge_run(self, facts: RunFacts) -> list[Finding]:
         if facts.crash:
             return [Finding("run", "fail", facts.crash)]
+        if facts.restarts:
+            return [Finding("run", "fail", f"{words}; it was started again") for words in facts.restarts]
         if facts.stopped_by == "interrupt":
             return [Finding("run", "inconclusive", "stopped by hand before its end")]
         return []

@@ -1,5 +1,6 @@
 """Starts, pins, watches and stops the processes of one run; what they leave behind is the log and the result."""
 
+import contextlib
 import json
 import sys
 import tempfile
@@ -12,6 +13,7 @@ from rt_runner import machine, paths
 from rt_runner.bus import BusChoice, HubProcess
 from rt_runner.children import Child, ChildError
 from rt_runner.config import Scenario
+from rt_runner.controller import controller_command, preview
 from rt_runner.errors import RtError, SetupError
 from rt_runner.provenance import Provenance
 from rt_runner.result import RunFacts
@@ -19,6 +21,7 @@ from rt_runner.result import RunFacts
 LOGGER_READY_S = 30.0
 READY_S = 90.0  # the plant compiles its kernel at first use and drives to the scenario's start
 ESTIMATOR_DRAIN_S = 0.25
+RESTARTS_MAX = 3  # of one process, where a controller closes the loop; without one, a process that ends fails the run
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,14 @@ class Supervisor:
     def __init__(self, plan: Plan, say: Callable[[str], None], progress: Callable[[dict], None]) -> None:
         self._plan, self._say, self._progress = plan, say, progress
         self._core, self._others = machine.split_cores(plan.core)
+        self._controller_core = min(self._others)  # its own where there are three
+        if plan.scenario.controller.present and len(self._others) > 1:
+            self._others = self._others - {self._controller_core}
         self._stopped = False
         self._children: list[Child] = []
+        self._workers: dict[str, Child] = {}
+        self._restarts: list[str] = []
+        self._road = Path()
 
     def stop(self) -> None:
         """Ask the run to end early."""
@@ -67,7 +76,10 @@ class Supervisor:
         RtError
             Set-up failed, or the logger itself was lost: there is no result then.
         """
-        with HubProcess.serving(self._plan.bus, self._say, self._others) as bus:
+        with contextlib.ExitStack() as stack:
+            if self._plan.scenario.controller.present:
+                self._road = stack.enter_context(preview(self._plan.scenario))
+            bus = stack.enter_context(HubProcess.serving(self._plan.bus, self._say, self._others))
             try:
                 logger = self._start_logger(bus)
                 if bus.startswith("rt_hub:"):
@@ -112,6 +124,7 @@ class Supervisor:
         if scenario.duration_s:
             command += ["--duration", str(scenario.duration_s)]
         command += [f"--fault={fault}" for fault in scenario.added_faults]
+        command += ["--obey"] if scenario.controller.present else []
         return [sys.executable, "-m", *command]
 
     def _run_on(self, bus: str, logger: Child) -> dict:
@@ -120,17 +133,16 @@ class Supervisor:
         try:
             plant = self._start("plant", self._plant_command(bus), self._others)
             plant.wait_line("ready", READY_S, lambda: self._stopped)
-            estimator = self._start("estimator", self._estimator_command(bus), None)
-            granted = estimator.wait_line("ready", 10.0, lambda: self._stopped)
-            facts = replace(facts, granted=granted)
-            for warning in granted.get("warnings", []):
-                self._say(f"warning: estimator: {warning}")
+            facts = replace(facts, granted=self._start_worker("estimator", bus))
+            if self._plan.scenario.controller.present:
+                self._start_worker("controller", bus)
             plant.tell("go")
             began = time.monotonic()
-            self._watch(plant, estimator, logger)
+            self._watch(plant, bus, logger)
             if not self._stopped:
                 time.sleep(ESTIMATOR_DRAIN_S)  # the last interval is estimated, too
-            self._end(estimator)  # first: a job after the last frame would only find stale inputs
+            for worker in self._workers.values():
+                self._end(worker)  # first: a job after the last frame would only find stale inputs
             self._end(plant)
         except ChildError as e:
             if not self._stopped:
@@ -144,8 +156,35 @@ class Supervisor:
             crash=crash,
             stopped_by="crash" if crash else "interrupt" if self._stopped else "end",
             steal_ms=None if steal_0 is None or steal_1 is None else steal_1 - steal_0,
+            restarts=tuple(self._restarts),
         )
         return self._finish(logger, facts)
+
+    def _start_worker(self, name: str, bus: str) -> dict:
+        """Start estimator or controller; what it was granted."""
+        command = self._estimator_command(bus) if name == "estimator" else self._controller_command(bus)
+        self._workers[name] = worker = self._start(name, command, None)
+        granted = worker.wait_line("ready", 10.0, lambda: self._stopped)
+        for warning in granted.get("warnings", []):
+            self._say(f"warning: {name}: {warning}")
+        return granted
+
+    def _restart(self, name: str, bus: str) -> None:
+        """The loop is closed: who has died is started again, a few times; the plant drives by its rule meanwhile."""
+        obituary = self._workers[name].obituary()
+        if not self._plan.scenario.controller.present or self._restarted(name) == RESTARTS_MAX:
+            raise ChildError(obituary)
+        self._restarts.append(obituary)
+        self._say(f"warning: {obituary}; it is started again")
+        self._start_worker(name, bus)
+
+    def _restarted(self, name: str) -> int:
+        return sum(child.name == name for child in self._children) - 1
+
+    def _controller_command(self, bus: str) -> list[str]:
+        how = ["--bus", bus, "--core", str(self._controller_core)]
+        how += [] if self._plan.realtime else ["--no-rt"]
+        return controller_command(self._plan.scenario.controller, self._road, how)
 
     def _estimator_command(self, bus: str) -> list[str]:
         e = self._plan.scenario.estimator
@@ -162,14 +201,15 @@ class Supervisor:
         ]
         return command if self._plan.realtime else [*command, "--no-rt"]
 
-    def _watch(self, plant: Child, estimator: Child, logger: Child) -> None:
-        """Until the plant is done; a child that ends before its time is an error."""
+    def _watch(self, plant: Child, bus: str, logger: Child) -> None:
+        """Until the plant is done; a child that ends before its time is an error, or is started again."""
         while not self._stopped:
             if self._plant_done(plant):
                 return
-            for child in (estimator, logger):
-                if child.ended():
-                    raise ChildError(child.obituary())
+            if logger.ended():
+                raise ChildError(logger.obituary())
+            for name in [name for name, worker in self._workers.items() if worker.ended()]:
+                self._restart(name, bus)
             self._drain(logger)
             time.sleep(0.05)
 

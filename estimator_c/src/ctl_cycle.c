@@ -114,9 +114,15 @@ static ctl_cycle_status send_all(ctl_cycle *self, const struct canfd_frame *fram
     return CTL_CYCLE_OK;
 }
 
+/* Nothing is known to act on: better said than made up. The plant then drives by itself, under its own rule. */
+static bool is_mute(const ctl_cycle *self, const controller_out_t *out) {
+    const bool needs_estimate = self->controller.kind != CONTROLLER_NONE;
+    return !ctl_bus_is_fresh(&self->bus, CTL_RX_VEHICLE) || (needs_estimate && isnan(out->theta_w_degc));
+}
+
 static ctl_cycle_status publish(ctl_cycle *self, const controller_out_t *out, bool *sent) {
     struct canfd_frame frames[CTL_COMMAND_FRAMES];
-    const bool mute = !ctl_bus_is_fresh(&self->bus, CTL_RX_VEHICLE);
+    const bool mute = is_mute(self, out);
     ctl_bus_command(&self->bus, out, mute, self->tick, frames);
     const est_io_status status = self->io.send(self->io.ctx, &frames[0]);
     *sent = status == EST_IO_OK;

@@ -4,7 +4,8 @@
  *
  * Frames leave in this order: TorqueCommand, CtlState, CtlSolve, then (response time known) CtlTimingA … CtlTimingD, then
  * housekeeping: once a second the counter frames, with the first job and every ten seconds the three identity frames. At most
- * eleven leave together. Without a fresh VehicleState the torques are sent as not available: nobody shall obey them.
+ * eleven leave together. Without a fresh VehicleState, or before the first estimate where one is needed, the torques are sent as
+ * not available: the plant then drives by itself, under its rule.
  * No allocation, no lock, no printing. One thread; the caller owns the object. */
 #ifndef CTL_CYCLE_H
 #define CTL_CYCLE_H

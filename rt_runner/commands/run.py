@@ -33,6 +33,11 @@ def add_scenario_options(p: argparse.ArgumentParser, default: str) -> None:
     p.add_argument("--setting", metavar="NAME", help=f"estimator setting: {', '.join(setting_names())}")
     p.add_argument("--period", type=float, metavar="S", help="period of the estimator's loop, 0.001 … 1")
     p.add_argument(
+        "--controller",
+        metavar="NAME",
+        help="who commands the torque: none, rule-150-155, rule-145-160, mpc-S, mpc-M, paper; off: the plant's driver",
+    )
+    p.add_argument(
         "--fault",
         action="append",
         metavar="SPEC",
@@ -50,7 +55,7 @@ def scenario_from(args):
     """The scenario that the options describe, checked."""
     from dataclasses import replace
 
-    from rt_runner.config import check_faults, check_period, load_scenario, with_duration, with_faults
+    from rt_runner.config import check_controller, check_faults, check_period, load_scenario, with_duration, with_faults
     from rt_runner.errors import UsageError
 
     s = with_faults(with_duration(load_scenario(args.scenario), args.duration), args.fault)
@@ -60,6 +65,9 @@ def scenario_from(args):
     if args.period is not None:
         check_period(args.period, "--period")
         s = replace(s, estimator=replace(s.estimator, period_s=args.period))
+    if args.controller is not None:
+        s = replace(s, controller=replace(s.controller, name=args.controller))
+        check_controller(s, "--controller")
     if args.setting is not None:
         s = replace(s, estimator=replace(s.estimator, setting=args.setting))
     return s
