@@ -31,6 +31,15 @@ bool rt_canary_ring_pop(rt_canary_ring *self, rt_canary_record *out) {
     return true;
 }
 
+void rt_canary_ring_arm(rt_canary_ring *self, int64_t due_ns) {
+    __atomic_store_n(&self->due_ns, due_ns, __ATOMIC_RELEASE);
+}
+
+int64_t rt_canary_ring_due(const rt_canary_ring *self) {
+    const int64_t due_ns = __atomic_load_n(&self->due_ns, __ATOMIC_ACQUIRE);
+    return due_ns != 0 ? due_ns : INT64_MAX;
+}
+
 uint64_t rt_canary_ring_lost(const rt_canary_ring *self) {
     return __atomic_load_n(&self->lost, __ATOMIC_RELAXED);
 }
@@ -69,6 +78,7 @@ static void *run(void *argument) {
     int64_t due_ns = self->t0_ns;
     while (!__atomic_load_n(&self->stop, __ATOMIC_ACQUIRE)) {
         due_ns = rt_canary_next_due_ns(self->t0_ns, self->period_ns, due_ns);
+        rt_canary_ring_arm(&self->ring, due_ns);
         while (!self->clock.sleep_until_ns(self->clock.ctx, due_ns)) {
         }
         const rt_canary_record record = {due_ns, self->clock.now_ns(self->clock.ctx)};

@@ -31,6 +31,7 @@ typedef struct {
     uint64_t written;  /* by the writer */
     uint64_t read;     /* by the reader */
     uint64_t lost;     /* by the writer: the ring was full */
+    int64_t due_ns;    /* by the writer: what it sleeps for; 0: nothing yet */
     rt_canary_record record[RT_CANARY_RING];
 } rt_canary_ring;
 
@@ -39,6 +40,12 @@ void rt_canary_ring_init(rt_canary_ring *self);
 
 /* Writer: O(1), never waits. A record that finds the ring full is dropped and counted. */
 void rt_canary_ring_push(rt_canary_ring *self, rt_canary_record record);
+
+/* Writer: it sleeps until `due_ns` from here on. O(1). */
+void rt_canary_ring_arm(rt_canary_ring *self, int64_t due_ns);
+
+/* Reader: what the canary sleeps for, or slept for if it has not run yet although that is past; INT64_MAX before the first. O(1). */
+int64_t rt_canary_ring_due(const rt_canary_ring *self);
 
 /* Reader: O(1), never waits. False when there is none. */
 bool rt_canary_ring_pop(rt_canary_ring *self, rt_canary_record *out);

@@ -190,6 +190,10 @@ static void hear_canary(rt_task *self, rt_job *job) {
         record(self, job, RT_METRIC_CANARY, self->canary_ns);
         rt_theft_note(&self->theft, heard.due_ns, heard.woke_ns);
     }
+    if (self->canary != NULL) { /* overdue, and yet we run: its timer comes later still, as ours did */
+        const int64_t due_ns = rt_canary_ring_due(self->canary);
+        rt_theft_note(&self->theft, due_ns, due_ns < job->start_ns ? job->start_ns : due_ns);
+    }
     job->canary_ns = self->canary_ns;
 }
 

@@ -16,6 +16,10 @@ void rt_theft_note(rt_theft *self, int64_t due_ns, int64_t woke_ns) {
     if (from_ns >= woke_ns) {
         return;
     }
+    if (self->used > 0 && from_ns == covered_ns) { /* the same theft, now known to have lasted longer */
+        self->span[newest].to_ns = woke_ns;
+        return;
+    }
     self->span[self->head].from_ns = from_ns;
     self->span[self->head].to_ns = woke_ns;
     self->head = (self->head + 1U) % RT_THEFTS;

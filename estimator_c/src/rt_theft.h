@@ -6,7 +6,7 @@
 
 #include <stdint.h>
 
-enum { RT_THEFTS = 16 }; /* remembered: for the jobs that waited behind the one that met them */
+enum { RT_THEFTS = 64 }; /* remembered: for the jobs that waited behind the one that met them */
 
 /* A canary wake-up later than this is theft; up to it it is ordinary wake-up latency (p99 here: 0.08 ms). */
 #define RT_THEFT_MIN_NS INT64_C(100000)
@@ -23,7 +23,8 @@ typedef struct {
 /* Empties it. */
 void rt_theft_init(rt_theft *self);
 
-/* The canary was due at `due_ns` and woke at `woke_ns`. Records come in order of time; what an earlier one covers counts once. O(1). */
+/* The canary was due at `due_ns` and woke at `woke_ns`, or has not run until then. In order of time; what an earlier call covers counts
+ * once. O(1). */
 void rt_theft_note(rt_theft *self, int64_t due_ns, int64_t woke_ns);
 
 /* Time taken between `from_ns` and `to_ns`. A lower bound: the canary cannot tell what was taken before it was due. O(RT_THEFTS). */

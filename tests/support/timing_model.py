@@ -109,8 +109,12 @@ class Model:
         total = policy.stop_total > 0 and misses >= policy.stop_total
         return total or (policy.stop_row > 0 and longest_run(self._misses(judged)) >= policy.stop_row)
 
-    def run(self, trace: Trace, heard: list[tuple[int, int]]) -> Job:
-        """One job; `heard`: the canary's wake-ups (due, woke) between the last job's publication and this one's."""
+    def run(self, trace: Trace, heard: list[tuple[int, int]], due_ns: int | None = None) -> Job:
+        """One job.
+
+        `heard`: the canary's wake-ups (due, woke) between the last job's publication and this one's; `due_ns`: what it
+        sleeps for then.
+        """
         s, n = self.setting, self.next_index()
         r, before = self.release(n), self.jobs[-1] if self.jobs else None
         self.heard += heard
@@ -131,7 +135,7 @@ class Model:
             preempt_ns=max(0, wall - cpu),
             resp_ns=resp,
             miss_late=late,
-            stolen_ns=self._stolen(r, trace.published_ns) if late and s.canary == 2 else 0,
+            stolen_ns=self._stolen(r, trace, due_ns) if late and s.canary == 2 else 0,
             canary_ns=self.heard[-1][1] - self.heard[-1][0] if self.heard else -1,
             cause="none",
         )
@@ -186,10 +190,14 @@ class Model:
             parts.insert(0, (self.delay_cause, backlog))
         return max(parts, key=lambda part: part[1])[0]
 
-    def _stolen(self, begin_ns: int, end_ns: int) -> int:
-        """Time in which a due canary did not run; its ordinary latency does not count."""
-        late = [(due, woke) for due, woke in self.heard if woke - due > THEFT_MIN_NS]
-        return sum(max(0, min(woke, end_ns) - max(due, begin_ns)) for due, woke in late)
+    def _stolen(self, release_ns: int, trace: Trace, due_ns: int | None) -> int:
+        """Time in which a due canary did not run; its ordinary latency does not count.
+
+        One that is overdue even now did not run until the job began, at least.
+        """
+        overdue = [] if due_ns is None else [(due_ns, trace.start_ns)]
+        late = [(due, woke) for due, woke in self.heard + overdue if woke - due > THEFT_MIN_NS]
+        return sum(max(0, min(woke, trace.published_ns) - max(due, release_ns)) for due, woke in late)
 
     def _sample(self, job: Job, trace: Trace, heard: list[tuple[int, int]]) -> None:
         values = [

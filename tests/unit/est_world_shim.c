@@ -151,11 +151,12 @@ int64_t est_world_run(const rt_task_config *config, const machine *m, const thef
             }
             out[ran].broken = status != EST_CYCLE_OK || broken(&cycle->task);
         }
-        b.sends = 1; /* counters only: no clock moves */
+        b.sends = FRAMES_BEFORE_PUBLISHED + 1; /* counters only: no clock moves */
         b.job = -1;
         (void)est_cycle_send_final(cycle);
     }
     *sent_count = b.sent_count;
+    end_canary(w);
     *heard_count = w->heard_count;
     free(w);
     return ran;

@@ -108,6 +108,7 @@ static void run_canary(world *w) {
     while (w->machine->canary != 0) {
         const int64_t due_ns = rt_canary_next_due_ns(w->t0_ns, w->period_ns, w->canary_at_ns);
         const int64_t woke_ns = back_on_core_ns(w, due_ns) + w->machine->canary_lat_ns;
+        rt_canary_ring_arm(&w->ring, due_ns);
         if (woke_ns > w->now_ns || w->heard_count == w->heard_room) {
             return;
         }
@@ -115,6 +116,14 @@ static void run_canary(world *w) {
         rt_canary_ring_push(&w->ring, record);
         w->heard[w->heard_count++] = record;
         w->canary_at_ns = woke_ns;
+    }
+}
+
+/* What it still sleeps for, as a wake-up that never came. */
+static void end_canary(world *w) {
+    if (w->machine->canary != 0 && w->heard_count < w->heard_room) {
+        const rt_canary_record pending = {rt_canary_next_due_ns(w->t0_ns, w->period_ns, w->canary_at_ns), INT64_MAX};
+        w->heard[w->heard_count++] = pending;
     }
 }
 
@@ -215,6 +224,7 @@ int64_t world_run(rt_task *task, const rt_task_config *config, const machine *m,
             fill(&out[ran], task, &job, w);
         }
     }
+    end_canary(w);
     *heard_count = w->heard_count;
     free(w);
     return ran;

@@ -192,7 +192,8 @@ def check(world, setting: tm.Setting, steps: list[dict], thefts: list, arriving:
         while upto < len(heard) and heard[upto][1] <= job["published_ns"]:
             upto += 1
         stimulus = {name: step[name] if name in ("sent", "stale") else job[name] for name in TRACE}
-        want = model.run(tm.Trace(**stimulus | {"stale": stale}), heard[known:upto])
+        due_ns = heard[upto][0] if upto < len(heard) else None
+        want = model.run(tm.Trace(**stimulus | {"stale": stale}), heard[known:upto], due_ns)
         known = upto
         a, b, d = (frames[number][f"EstTiming{letter}"] for letter in "ABD")
         assert a["release_index"] == want.index

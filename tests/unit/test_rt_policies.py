@@ -119,6 +119,12 @@ def test_cause_of_a_miss_with_and_without_the_canary(world, canary, steps, theft
     assert model.jobs[0].cause == cause
 
 
+def test_a_canary_that_is_overdue_when_the_job_is_out_is_evidence_too(world):
+    # The canary gets the core back after the job: what it sleeps for, since 1.25 ms, is known all the same.
+    model = check(world, setting(canary=2), [quiet()], STOLEN, canary_lat_ns=90 * US)
+    assert (model.jobs[0].cause, model.jobs[0].stolen_ns) == ("steal", 3_400 * US - 1_250 * US)
+
+
 def test_an_ordinary_wake_up_of_the_canary_excuses_nothing(world):
     model = check(world, setting(canary=2), [quiet(cpu_ns=1_050 * US)], [], canary_lat_ns=100 * US)
     assert (model.jobs[0].cause, model.jobs[0].stolen_ns) == ("long_compute", 0)

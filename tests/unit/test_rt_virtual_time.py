@@ -63,7 +63,8 @@ def model_of(setting: tm.Setting, jobs: list[dict], heard: list[tuple[int, int]]
         while upto < len(heard) and heard[upto][1] <= job["published_ns"]:
             upto += 1
         stimulus = {name: step[name] if name in ("sent", "stale") else job[name] for name in TRACE}
-        expected = model.run(tm.Trace(**stimulus), heard[known:upto])
+        due_ns = heard[upto][0] if upto < len(heard) else None
+        expected = model.run(tm.Trace(**stimulus), heard[known:upto], due_ns)
         known = upto
         want = vars(expected) | {"cause": tm.CAUSES.index(expected.cause)}
         assert {name: job[name] for name in want} == want
@@ -164,7 +165,7 @@ ordinary_step = st.builds(
 habits = st.fixed_dictionaries(
     {
         "start_ns": st.sampled_from([0, -2 * MS, 500 * US, 5 * MS]),
-        "canary_lat_ns": st.sampled_from([0, 30 * US, 100 * US]),
+        "canary_lat_ns": st.sampled_from([0, 30 * US, 100 * US, 400 * US]),
         "theft_is_cpu": st.integers(0, 1),
     }
 )
