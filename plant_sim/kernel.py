@@ -11,12 +11,12 @@ from math import atan, cos, exp, pi, sin, tanh
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from plant_sim.cycles import Cycle
 from plant_sim.dq_map import SPEED_STEP_RPM, THETA_GRID, TORQUE_STEP_NM, build_dq_map
 from plant_sim.driver import STANDSTILL_MPS, TorqueCommand
+from plant_sim.jit import compiled
 from plant_sim.losses import LossModel
 from plant_sim.lptn import DT_S, GRID_RPM, build_lptn
 from plant_sim.network import build_network
@@ -244,7 +244,7 @@ def _pack(params: PlantParams) -> tuple[Scalars, Tables]:
     return scalars, tables
 
 
-@njit(cache=True, fastmath=False)
+@compiled
 def _interpolate(values, position):
     position = min(max(position, 0.0), values.size - 1.0)
     i = min(int(position), values.size - 2)
@@ -252,7 +252,7 @@ def _interpolate(values, position):
     return values[i] * (1.0 - w) + values[i + 1] * w
 
 
-@njit(cache=True, fastmath=False)
+@compiled
 def _heat(theta, torque, speed, c, tab, heat):
     """Fill heat (70,) in W."""
     # Operating point: trilinear in magnet temperature, |T|, n.
@@ -298,7 +298,7 @@ def _heat(theta, torque, speed, c, tab, heat):
         heat[n] = q
 
 
-@njit(cache=True, fastmath=False)
+@compiled
 def _thermal(theta, heat, speed, boundary, tab, out):
     """Blend the exact steps of the two neighbouring grid speeds; result lands in theta."""
     position = min(speed / GRID_RPM, tab.a_t.shape[0] - 1.0)
@@ -323,7 +323,7 @@ def _thermal(theta, heat, speed, boundary, tab, out):
         theta[i] = out[i]
 
 
-@njit(cache=True, fastmath=False)
+@compiled
 def _run(ticks, tick, s, theta, boundary, derate, rule_start, rule_end, stop, obeys, order, c, tab, course, rows):
     """Advance the plant; return the number of ticks done."""
     heat, work = np.zeros(N_NODES), np.zeros(N_NODES)

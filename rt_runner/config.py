@@ -80,7 +80,8 @@ class Scenario:
     """One scenario, checked. ``name`` is what the user typed, ``path`` the file it came from.
 
     ``faults`` are the file's sensor faults, ``added_faults`` those of the command line, as text: what they mean is the
-    plant's business, see `check_faults`.
+    plant's business, see `check_faults`. ``sha256`` is of the file's bytes and, where there are any, of the latter:
+    plant, estimator and log speak of one scenario by it.
     """
 
     name: str
@@ -244,8 +245,11 @@ def with_duration(s: Scenario, duration_s: float | None) -> Scenario:
 
 
 def with_faults(s: Scenario, faults: list[str] | None) -> Scenario:
-    """The scenario with sensor faults added, where some are given."""
-    return replace(s, added_faults=s.added_faults + tuple(faults)) if faults else s
+    """The scenario with sensor faults added, where some are given; its hash then stands for the file and for them."""
+    for fault in faults or ():
+        digest = hashlib.sha256(f"{s.sha256} {fault}".encode()).hexdigest()
+        s = replace(s, added_faults=(*s.added_faults, fault), sha256=digest)
+    return s
 
 
 def check_faults(s: Scenario) -> None:

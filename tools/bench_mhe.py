@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.support.libest import ROOT, SOURCES, WEIGHTS, compile_library
+from tools.libest import ROOT, SOURCES, WEIGHTS, compile_library
 
 CASES = (("mhe", 0), ("mhe", 1), ("mhe", 2), ("mhe", 4), ("core", 0))
 

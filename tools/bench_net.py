@@ -26,9 +26,9 @@ import numpy as np
 from estimator_c.formulation.errors import FormulationError
 from estimator_c.formulation.generate import describe
 from estimator_c.formulation.weights import NetWeights, load_weights
-from tests.support.libest import WEIGHTS
 from tools.bench_mhe import build, measure, recorded_rows
 from tools.files import write_json
+from tools.libest import WEIGHTS
 
 STEPS = 300
 

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from estimator_c.formulation.errors import FormulationError
 from estimator_c.formulation.weights import load_weights
 from plant_sim.errors import PlantError
-from tests.support.libest import WEIGHTS
 from tools.files import write_json, write_whole
+from tools.libest import WEIGHTS
 from tools.solver_backends import table
 from tools.solver_backends.build import BuildError
 from tools.solver_backends.configs import HPIPM, REFERENCE, Config, UnknownBackend, chosen

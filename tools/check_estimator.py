@@ -20,7 +20,7 @@ import numpy as np
 from plant_sim.cycles import CycleSpec
 from plant_sim.params import load_params
 from plant_sim.plant import Plant
-from tests.support.libest import Estimator, Lib, Setting, load
+from tools.libest import Estimator, Lib, Setting, load
 
 JUDGED_AFTER_TICKS = 1000
 RUNNING = 2

@@ -23,8 +23,8 @@ from estimator_c.formulation.weights import load_weights
 from plant_sim.cycles import CycleSpec
 from plant_sim.params import load_params
 from plant_sim.plant import Plant
-from tests.support.libest import WEIGHTS, Estimator, Lib, Validity, compile_library
 from tools.files import write_json
+from tools.libest import WEIGHTS, Estimator, Lib, Validity, compile_library
 
 
 @dataclass(frozen=True)

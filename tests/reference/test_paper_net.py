@@ -9,8 +9,8 @@ import pytest
 
 from estimator_c.formulation.lstm_numpy import lstm_sequence
 from estimator_c.formulation.weights import load_weights
-from tests.support.libest import Lib, Mhe, compile_library
 from tests.support.nets import paper_net, reference_folder
+from tools.libest import Lib, Mhe, compile_library
 
 # Energies 18(14):3813, test set: winding / rotor in degC/s, to the digits its data give.
 RMSE = (0.03725, 0.02820)

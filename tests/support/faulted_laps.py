@@ -11,9 +11,9 @@ import numpy as np
 
 from plant_sim.cycles import CycleSpec
 from plant_sim.faults import Fault, parse_fault
-from tests.support.libest import WEIGHTS, Estimator, Lib, compile_library
 from tools.compare_drives import Lap, drive_lap, sense
 from tools.estimators.drive import Drive
+from tools.libest import WEIGHTS, Estimator, Lib, compile_library
 
 OK, OFFSET, NOISE, STUCK, DROPOUT, SPIKE, DRIFT, SLOW = range(8)  # sensor_class_t
 INIT, STARTING, RUNNING, PREDICTING, INPUT_STALE, INVALID, OPEN_LOOP, FALLBACK = range(8)  # estimator_status_t

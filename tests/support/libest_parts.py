@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.support.libest import Calibration, Lib, Setting
+from tools.libest import Calibration, Lib, Setting
 
 f64 = ct.c_double
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from estimator_c.formulation.lstm_numpy import lstm_step
 from estimator_c.formulation.weights import LstmWeights
-from tests.support.libest import Lib, Mhe, Setting
+from tools.libest import Lib, Mhe, Setting
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,9 @@ def test_an_offset_of_the_command_line_is_in_the_measurement_and_in_the_truth(tm
     assert result["faults"] == ["offset:-20@430-440"]
     assert bad.metadata["run"]["faults"] == "offset:-20@430-440"
     assert json.loads(bad.attachments["scenario_as_run.json"])["added_faults"] == ["offset:-20@430-440"]
+    said = next(f.values["scenario_hash"] for f in bad.frames() if f.name == "PlantIdentity")
+    assert int(said) == int(json.loads(bad.attachments["hashes.json"])["scenario_sha256"][:6], 16)
+    assert said != next(f.values["scenario_hash"] for f in good.frames() if f.name == "PlantIdentity")
     inspected = rt_runner("inspect", tmp_path / "bad.mcap")
     assert inspected.returncode == 0, inspected.stderr
     assert "recomputed from the frames: the same result" in inspected.stdout

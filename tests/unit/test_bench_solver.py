@@ -14,9 +14,9 @@ from estimator_c.formulation.mhe import LOSSES, MheOracle, MheProblem
 from estimator_c.formulation.weights import load_weights
 from plant_sim.faults import parse_fault
 from rt_runner.cli import main as rt_runner
-from tests.support.libest import ROOT, WEIGHTS, Estimator, Lib, compile_library
 from tools import bench_solver
 from tools.compare_drives import drive_lap, sense
+from tools.libest import ROOT, WEIGHTS, Estimator, Lib, compile_library
 from tools.solver_backends import stream, table
 from tools.solver_backends.configs import CONFIGS, KEYS, REFERENCE, UnknownBackend, chosen
 from tools.solver_backends.contraction import contraction_of

@@ -119,6 +119,9 @@ def test_faults_of_the_command_line_come_on_top():
     more = with_faults(s, ["stuck@1-2/r"])
     assert (more.faults, more.all_faults) == (s.faults, ("offset:-20@430-550", "stuck@1-2/r"))
     assert with_faults(s, None) is s
+    assert more.sha256 == with_faults(s, ["stuck@1-2/r"]).sha256 != s.sha256, "another scenario, and known as such"
+    assert more.sha256 != with_faults(s, ["stuck@1-2/w"]).sha256
+    assert with_faults(more, ["drift:1@3-4"]) == with_faults(s, ["stuck@1-2/r", "drift:1@3-4"])
     check_faults(more)
 
 

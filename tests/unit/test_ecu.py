@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.libest import WEIGHTS
 from tests.support.nets import random_net
 from tools import bench_ecu, ecu_image
 from tools.ecu_image import Image, ToolError, build_image
 from tools.ecu_replay import Replay, differing_steps, fixed_sweeps, replay_ecu, replay_host
+from tools.libest import WEIGHTS
 from tools.solver_backends.stream import Segment, Situation, record_all
 
 SWEEPS = 2

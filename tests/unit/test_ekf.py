@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from estimator_c.formulation.lstm_numpy import lstm_step
 from estimator_c.formulation.weights import NetWeights, load_weights
 from tests.support.faulted_laps import FALLBACK, RUNNING, lap_of, library
-from tests.support.libest import WEIGHTS, Estimator
 from tests.support.libest_parts import Ekf
-from tests.support.mhe_recorder import Record, record
 from tools.compare_drives import sense
 from tools.estimators.drive import Drive
+from tools.libest import WEIGHTS, Estimator
+from tools.mhe_recorder import Record, record
 
 DT_S = 0.1
 STEPS = 400

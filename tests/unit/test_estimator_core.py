@@ -11,8 +11,8 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from estimator_c.formulation.weights import LstmWeights, load_weights
-from tests.support.libest import WEIGHTS, Estimator, Lib, Out, compile_library
 from tests.support.twin import Recording, twin_estimates
+from tools.libest import WEIGHTS, Estimator, Lib, Out, compile_library
 
 INIT, STARTING, RUNNING, PREDICTING, INPUT_STALE, INVALID, OPEN_LOOP, FALLBACK = range(8)
 SLOW = hypothesis_settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.libest import ROOT, SOURCES, WEIGHTS, compile_library
+from tools.libest import ROOT, SOURCES, WEIGHTS, compile_library
 
 BASE = ROOT / "estimator_c"
 SANITIZE = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]

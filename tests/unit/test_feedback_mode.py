@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.support.libest import WEIGHTS, Estimator, Lib, compile_library
 from tools.compare_drives import drive_lap, sense
+from tools.libest import WEIGHTS, Estimator, Lib, compile_library
 
 
 def test_feedback_publishes_nearly_the_solution_and_loses_nothing() -> None:

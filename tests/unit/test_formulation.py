@@ -21,8 +21,8 @@ from estimator_c.formulation.c_printer import c_function
 from estimator_c.formulation.errors import FormulationError
 from estimator_c.formulation.settings import FIELDS, load_settings
 from estimator_c.formulation.weights import load_weights
-from tests.support.libest import ROOT, SETTINGS, WEIGHTS, Lib, Setting, compile_library
 from tests.support.nets import random_net
+from tools.libest import ROOT, SETTINGS, WEIGHTS, Lib, Setting, compile_library
 
 
 def run_generator(

@@ -14,8 +14,8 @@ from estimator_c.formulation.lstm_numpy import lstm_step
 from estimator_c.formulation.mhe import LOSSES
 from estimator_c.formulation.settings import FIELDS
 from estimator_c.formulation.weights import load_weights
-from tests.support.libest import WEIGHTS
 from tests.support.nets import random_net
+from tools.libest import WEIGHTS
 from tools.solver_backends.build import BuildError, build_hpipm
 from tools.solver_backends.configs import CONFIGS, HPIPM, REFERENCE, Config
 from tools.solver_backends.figures import THETA

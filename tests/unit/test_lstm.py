@@ -19,8 +19,8 @@ from estimator_c.formulation.generate import generate
 from estimator_c.formulation.lstm_numpy import lstm_sequence, lstm_step
 from estimator_c.formulation.net import build_net
 from estimator_c.formulation.weights import NetWeights, load_weights
-from tests.support.libest import ROOT, SETTINGS, WEIGHTS, Lib, compile_library
 from tests.support.nets import random_net, torch_net
+from tools.libest import ROOT, SETTINGS, WEIGHTS, Lib, compile_library
 
 TOLERANCE = 1e-12
 STEPS = 300

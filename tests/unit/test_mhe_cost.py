@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.libest import WEIGHTS
 from tools.bench_mhe import build, measure
+from tools.libest import WEIGHTS
 
 SWEEPS = 2
 BUDGET = 160_000  # instructions per step at two sweeps, portable, double, gcc -O2

@@ -14,8 +14,8 @@ from estimator_c.formulation.generate import generate
 from estimator_c.formulation.mhe import MheOracle, MheProblem
 from estimator_c.formulation.real import FLOAT, REALS
 from estimator_c.formulation.weights import NetWeights, load_weights
-from tests.support.libest import MHE, NODES, ROOT, SETTINGS, SOLVER, WEIGHTS, Lib, Setting, compile_library
-from tests.support.mhe_recorder import Record, Recorder, record
+from tools.libest import MHE, NODES, ROOT, SETTINGS, SOLVER, WEIGHTS, Lib, Setting, compile_library
+from tools.mhe_recorder import Record, Recorder, record
 
 AGREEMENT_DEGC = 1e-6
 FLOAT_AGREEMENT_DEGC = 5e-5

@@ -10,10 +10,10 @@ import pytest
 
 from estimator_c.formulation.mhe import MheOracle
 from estimator_c.formulation.weights import NetWeights, load_weights
-from tests.support.libest import Estimator, Lib, compile_library
-from tests.support.mhe_recorder import Recorder, record
 from tests.support.nets import random_net
 from tools.bench_net import cost_of
+from tools.libest import Estimator, Lib, compile_library
+from tools.mhe_recorder import Recorder, record
 
 AGREEMENT_DEGC = 1e-6
 STEPS = (1, 15, 18)  # the growing window, the first full one, after shifts

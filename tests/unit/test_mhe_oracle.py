@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from estimator_c.formulation.lstm_numpy import lstm_step
 from estimator_c.formulation.mhe import MheOracle
 from estimator_c.formulation.weights import NetWeights, load_weights
-from tests.support.libest import NODES, WEIGHTS, Lib, Mhe, compile_library
-from tests.support.mhe_recorder import Record, Recorder, record
+from tools.libest import NODES, WEIGHTS, Lib, Mhe, compile_library
+from tools.mhe_recorder import Record, Recorder, record
 
 AGREEMENT_DEGC = 1e-6
 TIGHT = {"tolerance_degc": 1e-9, "max_sweeps": 60, "loss": 0}  # robust ones: test_mhe_kernels.py

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from estimator_c.formulation.generate import generate
 from estimator_c.formulation.real import GATE_ERROR, REALS
-from tests.support.libest import ROOT, SETTINGS, WEIGHTS
+from tools.libest import ROOT, SETTINGS, WEIGHTS
 
 LN2 = np.log(np.longdouble(2))
 PORTABLE = """#include "real.h"

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from estimator_c.formulation.lstm_numpy import lstm_sequence, lstm_step
 from estimator_c.formulation.weights import load_weights
-from tests.support.libest import WEIGHTS
 from tests.support.nets import random_net
 from tools.estimators import lptn
 from tools.estimators.drive import DELAY_STEPS, Drive, interval_means, run, run_each
@@ -20,6 +19,7 @@ from tools.estimators.plain import MovingAverage
 from tools.estimators.registry import GATED, OFFLINE, UnknownEstimator, make, offline
 from tools.estimators.tuned import load_tuned
 from tools.estimators.ukf import Ukf, square_root
+from tools.libest import WEIGHTS
 
 INF = math.inf
 NET = load_weights(WEIGHTS)

@@ -9,8 +9,8 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from tests.support.faulted_laps import library
-from tests.support.libest import Estimator, Out
 from tests.support.libest_parts import OffsetCalibration
+from tools.libest import Estimator, Out
 
 DATASHEET, MEASURING, FROZEN, REFUSED = range(4)  # calibration_state_t
 DELAY, VALUES = 15, 100

@@ -24,8 +24,8 @@ from tests.support.faulted_laps import (
     STUCK,
     library,
 )
-from tests.support.libest import Estimator
 from tests.support.libest_parts import Monitor, SlowObserver, Verdict
+from tools.libest import Estimator
 
 SIGMA = math.sqrt(0.1)  # of a value
 VARIANCE = 1e-3  # of its prediction

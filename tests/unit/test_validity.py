@@ -15,10 +15,10 @@ import pytest
 from estimator_c.formulation.envelope import read_envelope
 from estimator_c.formulation.errors import FormulationError
 from estimator_c.formulation.weights import load_weights
-from tests.support.libest import WEIGHTS, Lib, Validity, compile_library
 from tests.support.nets import random_net
 from tools.check_validity import CASES, watch
 from tools.envelope import envelope_of, novelty_of
+from tools.libest import WEIGHTS, Lib, Validity, compile_library
 from tools.rows import Rows
 
 JUDGED, SETTLING, NOT_AVAILABLE = 2, 1, 0

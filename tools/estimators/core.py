@@ -7,9 +7,9 @@ import ctypes as ct
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.support.libest import Estimator as CoreObject
-from tests.support.libest import Lib, Setting
 from tools.estimators.drive import TICKS, Drive, Estimates
+from tools.libest import Estimator as CoreObject
+from tools.libest import Lib, Setting
 
 Array = NDArray[np.float64]
 # Columns of est_batch.h.

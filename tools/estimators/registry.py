@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 
 from estimator_c.formulation.weights import load_weights
+from rt_runner.errors import SetupError
 from tools.estimators.drive import VARIANCE_K2, Estimator
 from tools.estimators.fixed_gain import FixedGain
 from tools.estimators.lptn_kf import LptnKf
@@ -32,8 +33,17 @@ class UnknownEstimator(Exception):
 
 
 def settings() -> tuple[str, ...]:
-    """Names of the C core's settings, by their files."""
-    return tuple(sorted(path.stem for path in (BASE / "settings").glob("*.toml")))
+    """Names of the C core's settings, by their files.
+
+    Raises
+    ------
+    SetupError
+        There are none: this is no checkout.
+    """
+    found = tuple(sorted(path.stem for path in (BASE / "settings").glob("*.toml")))
+    if not found:
+        raise SetupError(f"{BASE / 'settings'} is missing: settings, weights and DBC are in a checkout: run this there")
+    return found
 
 
 def known() -> tuple[str, ...]:
@@ -53,8 +63,8 @@ def make(name: str) -> Estimator:
         return offline(name, load_tuned())
     if name not in settings():
         raise UnknownEstimator(f"no estimator '{name}': choose from {', '.join(known())}")
-    from tests.support.libest import load
     from tools.estimators.core import Core
+    from tools.libest import load
 
     lib = load()
     try:

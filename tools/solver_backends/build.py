@@ -10,7 +10,7 @@ import casadi as ca
 from estimator_c.formulation.generate import generate
 from estimator_c.formulation.real import DOUBLE, Real
 from estimator_c.formulation.weights import load_weights
-from tests.support.libest import ROOT, SETTINGS
+from tools.libest import ROOT, SETTINGS
 from tools.solver_backends.model import write_model
 
 HERE = Path(__file__).resolve().parent

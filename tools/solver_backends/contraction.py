@@ -21,9 +21,9 @@ import numpy as np
 from estimator_c.formulation.errors import FormulationError
 from estimator_c.formulation.generate import describe
 from estimator_c.formulation.weights import load_weights
-from tests.support.libest import WEIGHTS, Lib, Mhe, compile_library
-from tests.support.mhe_recorder import Recorder, record
 from tools.files import write_whole
+from tools.libest import WEIGHTS, Lib, Mhe, compile_library
+from tools.mhe_recorder import Recorder, record
 from tools.solver_backends import table
 
 BEGIN, END = "<!-- contraction: begin -->", "<!-- contraction: end -->"

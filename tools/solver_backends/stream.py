@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant_sim.faults import load_catalogue, parse_fault
-from tests.support.libest import Estimator, Lib, compile_library
 from tools.compare_drives import Lap, drive_lap, sense
+from tools.libest import Estimator, Lib, compile_library
 
 Array = NDArray[np.float64]
 INIT, START, ADVANCE, ARRIVAL, MEASURE, FORGET, SHIFT, WEIGH, SOLVE = range(1, 10)  # stream.h

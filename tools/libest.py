@@ -1,4 +1,4 @@
-"""ctypes binding of the estimator's C: the same functions the binary runs, driven from Python."""
+"""ctypes binding of the estimator's C: the same functions the binary runs, driven from Python, by tools and tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[2]
+from rt_runner import paths
+from rt_runner.errors import SetupError
+
+ROOT = Path(__file__).resolve().parents[1]
 CORE = ("mhe", "mhe_loss", "ekf", "slow_observer", "sensor_monitor", "fusion", "offset_calibration", "validity",
         "estimator", "estimator_feed", "estimator_publish")  # fmt: skip
 MHE = ("src/mhe.c", "src/mhe_loss.c")
@@ -112,22 +115,44 @@ class Out(ct.Structure):
 
 @cache
 def load(weights: Path | None = None) -> Lib:
-    """The estimator's library: compiled from the given weights, or build/lib when it carries lstm8.json.
+    """The estimator's library: compiled from the given weights, or the built one, or (not built) of lstm8.json.
 
-    RT_LIBESTIMATOR names a library to use instead of build/lib/libestimator.so (an ASan build, say).
+    RT_LIBESTIMATOR names a library to use instead of lib/libestimator.so of the build folder (an ASan build, say).
+
+    Raises
+    ------
+    SetupError
+        RT_LIBESTIMATOR is no such library, or nothing is built and there are no sources to compile it from.
     """
-    if weights is None:
-        built = Path(os.environ.get("RT_LIBESTIMATOR", ROOT / "build" / "lib" / "libestimator.so"))
-        if built.exists():
-            return Lib(built)
-        weights = WEIGHTS
-    return Lib(compile_library(weights))
+    if weights is not None:
+        return Lib(compile_library(weights))
+    named = os.environ.get("RT_LIBESTIMATOR")
+    built = Path(named) if named else paths.build_dir() / "lib" / "libestimator.so"
+    if named or built.exists():
+        return _opened(built)
+    return Lib(compile_library(WEIGHTS))
+
+
+def _opened(path: Path) -> Lib:
+    try:
+        return Lib(path)
+    except (OSError, AttributeError, ValueError) as error:
+        raise SetupError(
+            f"{path} is no library of this estimator ({error}): run 'make build', or mend RT_LIBESTIMATOR"
+        ) from None
 
 
 def compile_library(weights: Path, flags: tuple[str, ...] = ("-O2",)) -> Path:
     """Generate the C of `weights` and compile it into a folder of this run; returns the shared library."""
     from estimator_c.formulation.generate import generate
 
+    sources = [ROOT / "estimator_c" / source for source in SOURCES]
+    missing = [path for path in (weights, SETTINGS, *sources) if not path.exists()]
+    if missing:
+        raise SetupError(
+            f"{missing[0]} is missing: the estimator's library is built from a checkout ('make build' there); "
+            "RT_LIBESTIMATOR=FILE.so names a built one"
+        )
     folder = Path(tempfile.gettempdir()) / f"rt-libest-{os.getuid()}-{os.getpid()}"
     key = hashlib.sha256(weights.read_bytes() + " ".join(flags).encode()).hexdigest()[:16]
     out = folder / key
@@ -140,7 +165,7 @@ def compile_library(weights: Path, flags: tuple[str, ...] = ("-O2",)) -> Path:
     base = ROOT / "estimator_c"
     command = ["gcc", "-std=c11", "-D_GNU_SOURCE", "-g", "-fPIC", "-shared", "-fno-math-errno", *flags]
     command += [f"-I{base / 'src'}", f"-I{base / 'src' / 'solver'}", f"-I{out}"]
-    command += [str(base / source) for source in SOURCES]
+    command += [str(source) for source in sources]
     command += [str(path) for path in generated if path.suffix == ".c"] + ["-o", str(library), "-lm"]
     subprocess.run(command, check=True, stdout=sys.stderr)
     return library

@@ -9,7 +9,7 @@ import numpy as np
 from estimator_c.formulation.lstm_numpy import lstm_step
 from estimator_c.formulation.mhe import MheProblem
 from estimator_c.formulation.weights import NetWeights
-from tests.support.libest import NODES, Lib, Mhe, Setting
+from tools.libest import NODES, Lib, Mhe, Setting
 
 
 @dataclass(frozen=True)
