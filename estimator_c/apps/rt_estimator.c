@@ -16,16 +16,28 @@
 #include "est_report.h"
 #include "thermal_net.h"
 #include "rt_clock.h"
+#include "rt_canary.h"
 #include "rt_grant.h"
+#include "rt_machine.h"
+#include "rt_reaction.h"
 
 enum { MIN_PERIOD_US = 1000, MAX_PERIOD_US = 1000000, DEFAULT_PERIOD_US = 100000, DEFAULT_PRIORITY = 80, MAX_CORE = 1023 };
-enum { MIN_WARMUP_RELEASES = 5, US_PER_S = 1000000 };
+enum { MIN_WARMUP_RELEASES = 5, US_PER_S = 1000000, MAX_GRACE = 1000000 };
+enum { EXIT_TIMING = 2 }; /* the policy stopped it: too many misses */
 
 typedef struct {
     const char *bus;
     const est_setting_t *setting;
     int64_t period_us;
     rt_request request;
+    rt_reaction reaction;
+    est_on_miss on_miss;
+    uint32_t mk_m;
+    uint32_t mk_k;
+    int64_t grace_releases;  /* -1: a second, at least MIN_WARMUP_RELEASES */
+    injections faults;
+    bool canary;
+    bool on_frame;
     bool lockstep;
     bool replay; /* lock-step where the records say which job ran when */
 } options;
@@ -38,6 +50,8 @@ static est_lockstep lockstep;
 static est_port port_state;
 static can_port_t port;
 static rt_stats scratch;
+static rt_canary canary;
+static rt_machine machine;
 static volatile sig_atomic_t stop_requested;
 
 static void on_stop(int signal_number) {
@@ -66,7 +80,10 @@ static bool was_written(const char *what) {
 
 static void usage(FILE *out) {
     (void)fputs("usage: rt_estimator --bus socketcan:IFACE|rt_hub:PATH [--setting NAME] [--period-us 1000..1000000]\n"
-                "                    [--core N] [--priority 1..99] [--no-rt]\n"
+                "                    [--core N] [--priority 1..99] [--no-rt] [--no-canary]\n"
+                "                    [--trigger time|frame] [--policy skip|queue:N|rebase|cut:US|stop:total:M|stop:row:M]\n"
+                "                    [--on-miss late|hold|predict|invalid] [--grace-releases N] [--mk M,K]\n"
+                "                    [--inject compute:US@RELEASE|sleep:US@RELEASE] …\n"
                 "       rt_estimator --lockstep [--setting NAME] [--period-us …]   records on stdin and stdout\n"
                 "       rt_estimator --replay [--setting NAME] [--period-us …]     the same, and they say when each job ran\n",
                 out);
@@ -88,6 +105,80 @@ static int bad_setting(const char *name) {
     return fail("--setting: no setting is called '%s'; compiled in are: %s", name, known);
 }
 
+static bool parse_name(const char *text, const char *const *names, int count, int *value) {
+    for (int i = 0; i < count; i++) {
+        if (strcmp(text, names[i]) == 0) {
+            *value = i;
+            return true;
+        }
+    }
+    return false;
+}
+
+/* The options of what happens when time runs out. -1: go on; otherwise the exit status. */
+static int parse_timing(options *opt, int choice, const char *text) {
+    static const char *const reactions[] = {"late", "hold", "predict", "invalid"};
+    static const char *const triggers[] = {"time", "frame"};
+    long number = 0;
+    int which = 0;
+    switch (choice) {
+    case 'P':
+        return rt_reaction_parse(text, &opt->reaction)
+                   ? -1
+                   : fail("--policy: '%s' is none of skip, queue:N (N 1 to %d), rebase, cut:BUDGET_US, stop:total:M, stop:row:M",
+                          text, RT_QUEUE_MAX);
+    case 'o':
+        if (!parse_name(text, reactions, 4, &which)) {
+            return fail("--on-miss: '%s' is none of late, hold, predict, invalid", text);
+        }
+        opt->on_miss = (est_on_miss)which;
+        return -1;
+    case 'g':
+        if (!parse_number(text, 0, MAX_GRACE, &number)) {
+            return fail("--grace-releases: '%s' is no number of releases; give 0 to %d", text, MAX_GRACE);
+        }
+        opt->grace_releases = number;
+        return -1;
+    case 'm':
+        return rt_mk_parse(text, &opt->mk_m, &opt->mk_k)
+                   ? -1
+                   : fail("--mk: '%s' is not M,K: at most M misses in any K releases, 0 <= M < K <= %d", text, RT_MK_WINDOW);
+    case 'i':
+        return injections_add(&opt->faults, text)
+                   ? -1
+                   : fail("--inject: '%s' is neither compute:US@RELEASE nor sleep:US@RELEASE (US 1 to %d), or one more than %d", text,
+                          INJECTION_MAX_US, INJECTIONS_MAX);
+    case 'T':
+    default:
+        if (!parse_name(text, triggers, 2, &which)) {
+            return fail("--trigger: '%s' is neither time nor frame", text);
+        }
+        opt->on_frame = which == 1;
+        return -1;
+    }
+}
+
+/* What does not go together. -1: go on; otherwise the exit status. */
+static int check(options *opt) {
+    if (opt->lockstep == (opt->bus != NULL)) {
+        return fail("give either --bus socketcan:IFACE, --bus rt_hub:PATH, --lockstep or --replay; see rt_estimator --help");
+    }
+    if (!rt_reaction_valid(&opt->reaction, opt->period_us * 1000)) {
+        return fail("--policy: a cut budget must not be longer than the period of %lld us", (long long)opt->period_us);
+    }
+    if (opt->on_frame && opt->reaction.overrun != RT_OVERRUN_SKIP) {
+        return fail("--policy: queue and rebase are for the time grid; with --trigger frame give skip, cut or stop");
+    }
+    if (opt->lockstep && (opt->on_frame || opt->faults.count > 0)) {
+        return fail("--lockstep: there is no time in lock-step, so no --trigger frame and no --inject");
+    }
+    if (opt->lockstep) {
+        opt->request.real_time = false; /* it waits for its input, not for a clock */
+        opt->canary = false;
+    }
+    return -1;
+}
+
 /* -1: go on; otherwise the exit status. */
 static int parse(int argc, char **argv, options *opt) {
     static const struct option table[] = {
@@ -95,13 +186,17 @@ static int parse(int argc, char **argv, options *opt) {
         {"period-us", required_argument, NULL, 't'}, {"core", required_argument, NULL, 'c'},
         {"priority", required_argument, NULL, 'p'},  {"no-rt", no_argument, NULL, 'n'},
         {"lockstep", no_argument, NULL, 'l'},        {"help", no_argument, NULL, 'h'},
+        {"policy", required_argument, NULL, 'P'},    {"on-miss", required_argument, NULL, 'o'},
+        {"mk", required_argument, NULL, 'm'},        {"grace-releases", required_argument, NULL, 'g'},
+        {"inject", required_argument, NULL, 'i'},    {"trigger", required_argument, NULL, 'T'},
+        {"canary", no_argument, NULL, 'C'},          {"no-canary", no_argument, NULL, 'N'},
         {"replay", no_argument, NULL, 'r'},
         {NULL, 0, NULL, 0},
     };
     const char *setting = "default";
     long number = 0;
     int choice = 0;
-    *opt = (options){.period_us = DEFAULT_PERIOD_US, .request = {-1, DEFAULT_PRIORITY, true}};
+    *opt = (options){.period_us = DEFAULT_PERIOD_US, .request = {-1, DEFAULT_PRIORITY, true}, .grace_releases = -1, .canary = true};
     opterr = 0;
     while ((choice = getopt_long(argc, argv, "", table, NULL)) != -1) {
         switch (choice) {
@@ -140,6 +235,24 @@ static int parse(int argc, char **argv, options *opt) {
             opt->lockstep = true;
             opt->replay = true;
             break;
+        case 'C':
+            opt->canary = true;
+            break;
+        case 'N':
+            opt->canary = false;
+            break;
+        case 'P':
+        case 'o':
+        case 'm':
+        case 'g':
+        case 'i':
+        case 'T': {
+            const int bad = parse_timing(opt, choice, optarg);
+            if (bad != -1) {
+                return bad;
+            }
+            break;
+        }
         case 'h':
             usage(stdout);
             (void)fflush(stdout);
@@ -155,13 +268,7 @@ static int parse(int argc, char **argv, options *opt) {
     if (opt->setting == NULL) {
         return bad_setting(setting);
     }
-    if (opt->lockstep == (opt->bus != NULL)) {
-        return fail("give either --bus socketcan:IFACE, --bus rt_hub:PATH, --lockstep or --replay; see rt_estimator --help");
-    }
-    if (opt->lockstep) {
-        opt->request.real_time = false; /* it waits for its input, not for a clock */
-    }
-    return -1;
+    return check(opt);
 }
 
 static void catch_signals(const options *opt) {
@@ -203,20 +310,93 @@ static est_cycle_status set_up(const options *opt, const est_io *io, const rt_gr
         .t0_ns = 0,
         .warmup_releases = (uint64_t)((US_PER_S + opt->period_us - 1) / opt->period_us),
         .virtual_time = opt->lockstep,
+        .on_event = opt->on_frame,
+        .reaction = opt->reaction,
+        .mk_m = opt->mk_m,
+        .mk_k = opt->mk_k,
     };
     if (config.warmup_releases < MIN_WARMUP_RELEASES) {
         config.warmup_releases = MIN_WARMUP_RELEASES;
     }
-    return est_cycle_init(&cycle, &config, &clock, opt->setting, io, &identity);
+    if (opt->grace_releases >= 0) {
+        config.warmup_releases = (uint64_t)opt->grace_releases;
+    }
+    const est_cycle_status status = est_cycle_init(&cycle, &config, &clock, opt->setting, io, &identity);
+    if (status == EST_CYCLE_OK) {
+        est_cycle_on_miss(&cycle, opt->on_miss);
+        est_cycle_inject(&cycle, &opt->faults);
+    }
+    return status;
+}
+
+static const char *canary_of(void) {
+    return !canary.running ? "none" : canary.conclusive ? "conclusive" : "shown";
 }
 
 static void report_ready(FILE *out, const options *opt, const rt_granted *granted) {
     const est_report_identity identity = {opt->setting->name, net_weights_sha256, DRIVE_DBC_SHA256,
-                                          BUILD_SHA256,       opt->period_us,      granted};
+                                          BUILD_SHA256,       opt->period_us,      canary_of(),        granted};
     est_report_ready(out, &identity);
 }
 
 /* ---- real time ---------------------------------------------------------------------------------------------------- */
+
+static void start_helpers(const options *opt, rt_granted *granted) {
+    if (opt->canary) {
+        rt_canary_start(&canary, opt->period_us * 1000, granted);
+    }
+    if (canary.running) {
+        rt_task_set_canary(&cycle.task, &canary.ring, canary.conclusive);
+    }
+    rt_machine_start(&machine, granted->core, (int64_t)US_PER_S * 1000);
+    est_cycle_watch(&cycle, &machine);
+}
+
+static void stop_helpers(void) {
+    rt_canary_stop(&canary);
+    rt_machine_stop(&machine);
+}
+
+/* The loop, until a signal, the end of the bus or too many misses. */
+static est_cycle_status loop(est_report_run *run) {
+    est_cycle_status status = EST_CYCLE_OK;
+    rt_environment_read(&run->start, true);
+    est_cycle_start_grid(&cycle);
+    if (canary.running) {
+        rt_canary_aim(&canary, cycle.task.config.t0_ns);
+    }
+    while (stop_requested == 0 && status != EST_CYCLE_GONE && status != EST_CYCLE_STOPPED) {
+        status = est_cycle_wait_and_run(&cycle);
+        if (!run->warm_valid && cycle.task.last_index >= cycle.task.config.warmup_releases) {
+            rt_environment_read(&run->warm, false);
+            run->warm_valid = true;
+        }
+    }
+    return status;
+}
+
+/* The counters once more, the figures, and how it ended. */
+static int conclude(est_report_run *run, est_cycle_status status) {
+    const bool stopped = status == EST_CYCLE_STOPPED;
+    if (status != EST_CYCLE_GONE) {
+        status = est_cycle_send_final(&cycle);
+    }
+    rt_environment_read(&run->end, true);
+    run->stopped_by = status == EST_CYCLE_GONE ? "bus" : stopped ? "misses" : run->stopped_by;
+    est_report_final(stdout, &cycle, run, &scratch);
+    if (status == EST_CYCLE_GONE) {
+        return fail("%s", port.error);
+    }
+    if (!was_written("final")) {
+        return EXIT_FAILURE;
+    }
+    if (stopped) {
+        (void)fail("stopped by its policy: %llu late and %llu skipped releases after warm-up, %llu misses in a row at most",
+                   (unsigned long long)cycle.task.judged.miss_late, (unsigned long long)cycle.task.judged.miss_skipped,
+                   (unsigned long long)cycle.task.judged.consec_miss_max);
+    }
+    return stopped ? EXIT_TIMING : EXIT_SUCCESS;
+}
 
 static int run_on_bus(const options *opt) {
     rt_granted granted;
@@ -235,34 +415,16 @@ static int run_on_bus(const options *opt) {
         can_port_close(&port);
         return fail("setting '%s' does not fit this build; change estimator_c/settings and build again", opt->setting->name);
     }
+    start_helpers(opt, &granted);
     report_ready(stdout, opt, &granted);
-    if (!was_written("ready")) {
-        can_port_close(&port);
-        return EXIT_FAILURE;
+    int exit_status = EXIT_FAILURE;
+    if (was_written("ready")) {
+        const est_cycle_status status = loop(&run);
+        stop_helpers(); /* before the figures: nobody writes what they are made of */
+        exit_status = conclude(&run, status);
+    } else {
+        stop_helpers();
     }
-    rt_environment_read(&run.start, true);
-    est_cycle_start_grid(&cycle);
-
-    est_cycle_status status = EST_CYCLE_OK;
-    while (stop_requested == 0 && status != EST_CYCLE_GONE) {
-        status = est_cycle_wait_and_run(&cycle);
-        if (!run.warm_valid && cycle.task.last_index >= cycle.task.config.warmup_releases) {
-            rt_environment_read(&run.warm, false);
-            run.warm_valid = true;
-        }
-    }
-
-    rt_environment_read(&run.end, true);
-    if (status != EST_CYCLE_GONE) {
-        status = est_cycle_send_final(&cycle);
-    }
-    if (status == EST_CYCLE_GONE) {
-        run.stopped_by = "bus";
-    }
-    est_report_final(stdout, &cycle, &run, &scratch);
-    const int exit_status = status == EST_CYCLE_GONE ? fail("%s", port.error)
-                            : was_written("final")   ? EXIT_SUCCESS
-                                                     : EXIT_FAILURE;
     can_port_close(&port);
     return exit_status;
 }

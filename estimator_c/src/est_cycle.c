@@ -4,11 +4,9 @@
 #include <stddef.h>
 #include <string.h>
 
-_Static_assert(sizeof(est_cycle) <= 800000, "est_cycle.h says so");
-_Static_assert((int)EST_CYCLE_FRAMES_PER_JOB <= 11, "send queue of a CAN interface and its controller: more would be lost");
+#include "est_housekeeping.h"
 
-static const int64_t NS_PER_S = 1000000000;
-static const int64_t IDENTITY_EVERY_S = 10;
+_Static_assert(sizeof(est_cycle) <= 800000, "est_cycle.h says so");
 
 /* Feeds a minute of made-up driving to the estimator, which then starts afresh: pages and caches are warm. */
 static void rehearse(estimator_t *estimator, const est_setting_t *setting) {
@@ -23,9 +21,14 @@ static void rehearse(estimator_t *estimator, const est_setting_t *setting) {
     (void)estimator_init(estimator, setting); /* succeeded before */
 }
 
+/* How long a job waits for its frame, where frames are the releases. */
+static int64_t event_timeout_ns(void) {
+    return (int64_t)drive_messages[DRIVE_INDEX_TEMP_MEAS].timeout_ms * 1000000;
+}
+
 static void set_due(est_cycle *self, int64_t t0_ns) {
-    self->next_counters_ns = t0_ns + NS_PER_S;
-    self->next_identity_ns = t0_ns;
+    self->event_due_ns = t0_ns + event_timeout_ns();
+    est_housekeeping_set_due(self, t0_ns);
 }
 
 est_cycle_status est_cycle_init(est_cycle *self, const rt_task_config *config, const rt_clock *clock,
@@ -44,12 +47,29 @@ est_cycle_status est_cycle_init(est_cycle *self, const rt_task_config *config, c
     for (int ch = 0; ch < MHE_CHANNELS; ch++) { /* nothing is known before the first job */
         self->calibration.offset_degc[ch] = self->calibration.sigma_degc[ch] = (double)NAN;
     }
+    self->event_ns = -1;
     set_due(self, config->t0_ns);
     return EST_CYCLE_OK;
 }
 
+void est_cycle_on_miss(est_cycle *self, est_on_miss on_miss) {
+    self->on_miss = on_miss;
+}
+
+void est_cycle_inject(est_cycle *self, const injections *faults) {
+    self->faults = *faults;
+}
+
+void est_cycle_watch(est_cycle *self, const rt_machine *machine) {
+    self->machine = machine;
+}
+
+static int64_t now_of(const est_cycle *self) {
+    return self->task.clock.now_ns(self->task.clock.ctx);
+}
+
 void est_cycle_start_grid(est_cycle *self) {
-    const int64_t now_ns = self->task.clock.now_ns(self->task.clock.ctx);
+    const int64_t now_ns = now_of(self);
     if (rt_task_start_grid(&self->task, now_ns) == RT_TASK_OK) {
         set_due(self, now_ns);
     }
@@ -67,6 +87,14 @@ static void feed(estimator_t *estimator, const est_input *input) {
     }
 }
 
+/* The newest of several frames has the job. */
+static void note_event(est_cycle *self, int64_t at_ns) {
+    if (self->event_ns >= 0) {
+        rt_task_event_passed(&self->task, self->event_ns);
+    }
+    self->event_ns = at_ns;
+}
+
 static est_cycle_status read_inputs(est_cycle *self) {
     struct canfd_frame frame;
     est_input input;
@@ -82,6 +110,9 @@ static est_cycle_status read_inputs(est_cycle *self) {
         }
         if (est_bus_accept(&self->bus, &frame, at_ns, &input) == EST_BUS_INPUT) {
             feed(&self->estimator, &input);
+            if (input.id == EST_RX_TEMP_MEAS && self->task.config.on_event) {
+                note_event(self, at_ns);
+            }
         }
     }
     return EST_CYCLE_OK;
@@ -111,16 +142,6 @@ static est_output output_of(const estimator_out_t *out, bool motor_stale) {
     return output;
 }
 
-/* Sends `count` frames; a full bus loses a frame (counted by the port), a bus that has ended ends the cycle. */
-static est_cycle_status send_all(est_cycle *self, const struct canfd_frame *frames, size_t count) {
-    for (size_t i = 0; i < count; i++) {
-        if (self->io.send(self->io.ctx, &frames[i]) == EST_IO_GONE) {
-            return EST_CYCLE_GONE;
-        }
-    }
-    return EST_CYCLE_OK;
-}
-
 static est_cycle_status publish(est_cycle *self, const est_output *output, bool *sent) {
     struct canfd_frame frame;
     est_bus_estimate(&self->bus, output, &frame);
@@ -137,179 +158,197 @@ static est_cycle_status publish(est_cycle *self, const est_output *output, bool 
     est_bus_validity(&self->bus, output, &more[1]);
     est_bus_winding(&self->bus, output, &more[2]);
     est_bus_rotor(&self->bus, output, &more[3]);
-    return send_all(self, more, 4);
+    return est_housekeeping_send(self, more, 4);
 }
 
-static est_cycle_status publish_timing(est_cycle *self, const rt_job *job, bool stale, int64_t now_ns) {
+static est_cycle_status publish_timing(est_cycle *self, const rt_job *job, timing_output put_out, bool stale, int64_t now_ns) {
     const timing_job timing = {
         .miss_late = job->miss_late,
         .warmup = job->warmup,
         .stale_input = stale,
         .after_skip = job->after_skip,
         .miss_cause = (uint8_t)job->cause,
-        .output = TIMING_OUTPUT_COMPUTED,
+        .cut = job->cut,
+        .queued = job->queued,
+        .output = put_out,
         .release_index = job->index,
         .wake_lat_ns = job->wake_lat_ns,
         .exec_wall_ns = job->exec_wall_ns,
         .exec_cpu_ns = job->exec_cpu_ns,
         .resp_ns = job->resp_ns,
-        .canary_ns = TIMING_NA,
+        .canary_ns = job->canary_ns,
         .in_age_ns = {est_bus_in_age_ns(&self->bus, EST_RX_MOTOR_STATE, now_ns),
                       est_bus_in_age_ns(&self->bus, EST_RX_TEMP_MEAS, now_ns)},
     };
     struct canfd_frame frames[TIMING_JOB_FRAMES];
     est_bus_timing(&self->bus, &timing, frames);
-    return send_all(self, frames, TIMING_JOB_FRAMES);
+    return est_housekeeping_send(self, frames, TIMING_JOB_FRAMES);
 }
 
-static timing_stat stat_of(const rt_stats *stats) {
-    enum { P99 = 9900 };
-    timing_stat out = {TIMING_NA, stats->count > 0 ? stats->max_ns : TIMING_NA};
-    if (rt_stats_quantile(stats, P99, &out.p99_ns) == RT_QUANTILE_NA) {
-        out.p99_ns = TIMING_NA;
-    }
-    return out;
+/* ---- a job ---------------------------------------------------------------------------------------------------------- */
+
+/* What the cycle hands to the solver, which knows no clock. */
+typedef struct {
+    rt_task *task;
+    rt_job *job;
+} budget;
+
+static bool expired(void *ctx) {
+    const budget *self = ctx;
+    return rt_task_expired(self->task, self->job);
 }
 
-static timing_counters timing_of(const est_cycle *self) {
-    const rt_tally *tally = &self->task.total;
-    const rt_stats *stats = self->task.stats;
-    const timing_counters out = {
-        .releases = tally->releases,
-        .jobs = tally->jobs,
-        .miss_late = tally->miss_late,
-        .miss_skipped = tally->miss_skipped,
-        .overrun = tally->overrun,
-        .consec_miss_max = tally->consec_miss_max,
-        .mk_worst = tally->mk_worst,
-        .run_delay_ns = TIMING_NA,
-        .steal_ns = TIMING_NA,
-        .canary = {TIMING_NA, TIMING_NA},
-        .wake = stat_of(&stats[RT_METRIC_WAKE_LAT]),
-        .exec = stat_of(&stats[RT_METRIC_EXEC_WALL]),
-        .resp = stat_of(&stats[RT_METRIC_RESP]),
-    };
-    return out;
-}
-
-void est_cycle_counters(const est_cycle *self, est_counters *out) {
-    est_bus_faults faults;
-    est_io_counters io;
-    est_bus_read_faults(&self->bus, &faults);
-    self->io.counters(self->io.ctx, &io);
-    const estimator_counters_t *core = &self->estimator.counters;
-    const est_counters counters = {
-        .timing = timing_of(self),
-        .crc_errors = faults.crc_errors,
-        .seq_errors = faults.seq_errors,
-        .stale_inputs = self->stale_jobs,
-        .rx_drops = io.rx_drops,
-        .tx_drops = io.tx_drops,
-        .rejected = io.rejected + io.error_frames + faults.rejected,
-        .restarts = core->restarts,
-        .held_intervals = core->held_intervals,
-        .late_measurements = core->late_measurements,
-        .stray_ticks = core->stray_ticks,
-        .off_grid = core->off_grid,
-        .invalid_inputs = core->invalid_inputs,
-        .unconverged = core->unconverged,
-        .repeated_ticks = core->repeated_ticks,
-        .calibration = self->calibration,
-    };
-    *out = counters;
-}
-
-est_cycle_status est_cycle_send_final(est_cycle *self) {
-    est_counters counters;
-    struct canfd_frame frames[EST_COUNTER_FRAMES];
-    est_cycle_counters(self, &counters);
-    for (size_t i = 0; i < EST_COUNTER_FRAMES; i++) {
-        est_bus_counter(&self->bus, i, &counters, &frames[i]);
-    }
-    return send_all(self, frames, EST_COUNTER_FRAMES);
-}
-
-/* The first multiple of `every_ns` on the grid of `due_ns` after `now_ns`. */
-static int64_t next_due(int64_t due_ns, int64_t every_ns, int64_t now_ns) {
-    return due_ns + ((now_ns - due_ns) / every_ns + 1) * every_ns;
-}
-
-/* Begins a round with what is due. Counters are taken once for all of its frames, so that they fit together. */
-static void begin_round(est_cycle *self, int64_t release_ns) {
-    const bool counters_due = release_ns >= self->next_counters_ns;
-    const bool identity_due = release_ns >= self->next_identity_ns;
-    if (counters_due) {
-        self->next_counters_ns = next_due(self->next_counters_ns, NS_PER_S, release_ns);
-        est_cycle_counters(self, &self->round);
-    }
-    if (identity_due) {
-        self->next_identity_ns = next_due(self->next_identity_ns, IDENTITY_EVERY_S * NS_PER_S, release_ns);
-    }
-    self->round_next = counters_due ? 0 : EST_COUNTER_FRAMES;
-    self->round_end = EST_COUNTER_FRAMES + (identity_due ? (size_t)EST_IDENTITY_FRAMES : 0);
-}
-
-static est_cycle_status housekeeping(est_cycle *self, const rt_job *job) {
-    struct canfd_frame frames[EST_CYCLE_HOUSEKEEPING_FRAMES];
-    size_t count = 0;
-    if (self->round_next == self->round_end) {
-        begin_round(self, job->release_ns);
-    }
-    for (; count < EST_CYCLE_HOUSEKEEPING_FRAMES && self->round_next < self->round_end; self->round_next++) {
-        if (self->round_next < EST_COUNTER_FRAMES) {
-            est_bus_counter(&self->bus, self->round_next, &self->round, &frames[count++]);
+static void make_faults(est_cycle *self, rt_job *job) {
+    const rt_clock *clock = &self->task.clock;
+    for (uint32_t i = 0; i < self->faults.count; i++) {
+        const injection *fault = &self->faults.item[i];
+        if (fault->release != job->index) {
+            continue;
+        }
+        const int64_t until_ns = now_of(self) + fault->duration_ns;
+        if (fault->kind == INJECTION_SLEEP) {
+            (void)clock->sleep_until_ns(clock->ctx, until_ns);
         } else {
-            est_bus_identity(&self->bus, self->round_next - EST_COUNTER_FRAMES, &self->identity, &frames[count++]);
+            while (now_of(self) < until_ns && !rt_task_expired(&self->task, job)) {
+            }
         }
     }
-    return send_all(self, frames, count);
+}
+
+static void invalidate(est_output *output) {
+    output->status = ESTIMATOR_INVALID;
+    output->sweeps = 0;
+    output->theta_w_degc = output->theta_r_degc = (double)NAN;
+    output->innov_w_degc = output->innov_r_degc = (double)NAN;
+    for (int ch = 0; ch < MHE_CHANNELS; ch++) {
+        output->channel[ch].sigma_degc = output->channel[ch].upper_degc = (double)NAN;
+    }
+}
+
+/* What is put out in place of an estimate that is late already. */
+static timing_output stand_in(est_cycle *self, const estimator_base_t *base, estimator_out_t *out, bool motor_stale,
+                              est_output *output) {
+    if (self->on_miss == EST_ON_MISS_HOLD && self->has_last) {
+        *output = self->last_in_time;
+        output->innov_w_degc = output->innov_r_degc = (double)NAN;
+        return TIMING_OUTPUT_HELD;
+    }
+    if (self->on_miss == EST_ON_MISS_PREDICT && estimator_predict(&self->estimator, base, out)) {
+        *output = output_of(out, motor_stale);
+        return TIMING_OUTPUT_PREDICTED;
+    }
+    invalidate(output);
+    return TIMING_OUTPUT_INVALID;
+}
+
+static timing_output choose_output(est_cycle *self, const rt_job *job, const estimator_base_t *base, estimator_out_t *out,
+                                   est_output *output) {
+    const bool motor_stale = est_bus_is_stale(&self->bus, EST_RX_MOTOR_STATE);
+    timing_output put_out = TIMING_OUTPUT_COMPUTED;
+    *output = output_of(out, motor_stale);
+    if (self->on_miss != EST_ON_MISS_LATE && rt_task_late_now(&self->task, job)) {
+        put_out = stand_in(self, base, out, motor_stale, output);
+    } else {
+        self->last_in_time = *output;
+        self->has_last = true;
+    }
+    self->output_jobs[put_out]++;
+    return put_out;
 }
 
 /* `now_ns`: when the inputs are read. In lock-step record time stands still while a job runs; in real time it is when we woke. */
-static est_cycle_status run(est_cycle *self, rt_job *job, int64_t now_ns) {
+static est_cycle_status run(est_cycle *self, rt_job *job, int64_t now_ns, est_cycle_status read_status) {
+    budget left = {&self->task, job};
+    estimator_base_t base;
     estimator_out_t out;
+    est_output output;
     bool sent = false;
-    self->io.begin(self->io.ctx, now_ns);
-    est_cycle_status status = read_inputs(self);
+    est_cycle_status status = read_status;
+    self->last_release_ns = job->release_ns;
+    if (!self->task.config.on_event) {
+        self->io.begin(self->io.ctx, now_ns);
+        status = read_inputs(self);
+    }
     const bool bus_stale = est_bus_stale(&self->bus, now_ns, job->index);
-    estimator_step(&self->estimator, &out);
+    make_faults(self, job);
+    estimator_base(&self->estimator, &base);
+    estimator_step_within(&self->estimator, &out, self->task.config.reaction.budget_ns > 0 ? expired : NULL, &left);
     const bool stale = bus_stale || out.stale_input;
     self->stale_jobs += stale ? 1U : 0U;
     self->calibration = out.calibration;
-    const est_output output = output_of(&out, est_bus_is_stale(&self->bus, EST_RX_MOTOR_STATE));
     rt_task_stepped(&self->task, job);
+    const timing_output put_out = choose_output(self, job, &base, &out, &output);
     /* A job that finds the bus gone still ends in good order: every started job is accounted for. */
     const est_cycle_status published = publish(self, &output, &sent);
     rt_task_published(&self->task, job, sent, stale);
     estimator_finish(&self->estimator);
     status = status == EST_CYCLE_OK ? published : status;
     if (status == EST_CYCLE_OK) {
-        status = publish_timing(self, job, stale, now_ns);
+        status = publish_timing(self, job, put_out, stale, now_ns);
     }
+    est_housekeeping_note_warm(self, job);
     if (status == EST_CYCLE_OK) {
-        status = housekeeping(self, job);
+        status = est_housekeeping(self, job);
     }
     rt_task_done(&self->task, job);
     return status;
 }
 
+/* Waits for the frame that releases the next job, feeding what comes before it, and opens that job. */
+static est_cycle_status open_on_event(est_cycle *self, rt_job *job, est_cycle_status *read_status) {
+    *read_status = EST_CYCLE_OK;
+    while (self->event_ns < 0 && *read_status == EST_CYCLE_OK) {
+        const est_io_status waited = self->io.wait(self->io.ctx, self->event_due_ns);
+        if (waited == EST_IO_INTERRUPTED) {
+            return EST_CYCLE_INTERRUPTED;
+        }
+        const int64_t now_ns = now_of(self);
+        self->io.begin(self->io.ctx, now_ns);
+        *read_status = waited == EST_IO_GONE ? EST_CYCLE_GONE : read_inputs(self);
+        if (self->event_ns < 0 && now_ns >= self->event_due_ns) {
+            self->event_ns = self->event_due_ns;
+        }
+    }
+    if (self->event_ns < 0) {
+        return *read_status;
+    }
+    const int64_t release_ns = self->event_ns;
+    if (rt_task_event(&self->task, job, release_ns) == RT_TASK_STOPPED) {
+        return EST_CYCLE_STOPPED;
+    }
+    self->event_ns = -1;
+    self->event_due_ns = release_ns + event_timeout_ns();
+    return EST_CYCLE_OK;
+}
+
 est_cycle_status est_cycle_wait_and_run(est_cycle *self) {
     rt_job job;
-    if (rt_task_wait(&self->task, &job) != RT_TASK_OK) {
+    if (self->task.config.on_event) {
+        est_cycle_status read_status = EST_CYCLE_OK;
+        const est_cycle_status status = open_on_event(self, &job, &read_status);
+        return status == EST_CYCLE_OK ? run(self, &job, job.start_ns, read_status) : status;
+    }
+    switch (rt_task_wait(&self->task, &job)) {
+    case RT_TASK_OK:
+        return run(self, &job, job.start_ns, EST_CYCLE_OK);
+    case RT_TASK_STOPPED:
+        return EST_CYCLE_STOPPED;
+    case RT_TASK_INTERRUPTED:
+    case RT_TASK_BAD_CONFIG:
+    default:
         return EST_CYCLE_INTERRUPTED;
     }
-    return run(self, &job, job.start_ns);
 }
 
 est_cycle_status est_cycle_run_released(est_cycle *self) {
     rt_job job;
     rt_task_release(&self->task, &job);
-    return run(self, &job, job.release_ns);
+    return run(self, &job, job.release_ns, EST_CYCLE_OK);
 }
 
 est_cycle_status est_cycle_run_replayed(est_cycle *self, uint64_t index, int64_t now_ns) {
     rt_job job;
     self->task.next_index = index;
     rt_task_release(&self->task, &job);
-    return run(self, &job, now_ns);
+    return run(self, &job, now_ns, EST_CYCLE_OK);
 }

@@ -1,5 +1,6 @@
 #include "est_lockstep.h"
 
+#include <stddef.h>
 #include <string.h>
 
 #include "can_port.h"
@@ -51,7 +52,7 @@ void est_lockstep_init(est_lockstep *self, int in_fd, int out_fd) {
 }
 
 est_io est_lockstep_io(est_lockstep *self) {
-    const est_io io = {self, begin, receive, transmit, counters};
+    const est_io io = {self, begin, receive, transmit, counters, NULL};
     return io;
 }
 

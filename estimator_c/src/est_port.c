@@ -1,7 +1,10 @@
 #include "est_port.h"
 
+#include <errno.h>
+#include <poll.h>
 #include <stddef.h>
 #include <sys/socket.h>
+#include <time.h>
 
 #include "drive_e2e.h"
 #include "est_cycle.h"
@@ -11,6 +14,8 @@ enum {
     SEND_BUFFER_BYTES = 4 << 20,
     QUEUED_FRAME_BYTES = 800 /* what a queued frame costs the kernel: 212992 bytes hold 277 */
 };
+
+static const int64_t NS_PER_S = 1000000000;
 
 _Static_assert((int)CAN_PORT_SKIP_MAX == (int)EST_IO_SKIP_COST, "a skip costs what the cycle takes it to cost");
 
@@ -70,6 +75,19 @@ static void counters(void *ctx, est_io_counters *out) {
     out->error_frames = from->error_frames;
 }
 
+static est_io_status wait_until(void *ctx, int64_t until_ns) {
+    est_port *self = ctx;
+    const rt_clock clock = rt_clock_system();
+    const int64_t left_ns = until_ns - clock.now_ns(clock.ctx);
+    const struct timespec left = {left_ns > 0 ? left_ns / NS_PER_S : 0, left_ns > 0 ? left_ns % NS_PER_S : 0};
+    struct pollfd look = {.fd = self->port->fd, .events = POLLIN};
+    const int ready = ppoll(&look, 1, &left, NULL);
+    if (ready < 0) {
+        return errno == EINTR ? EST_IO_INTERRUPTED : EST_IO_GONE;
+    }
+    return ready > 0 ? EST_IO_OK : EST_IO_EMPTY; /* a bus that has ended is readable: recv says so */
+}
+
 est_io est_port_io(est_port *self, can_port_t *port) {
     self->port = port;
     self->offset_ns = 0;
@@ -97,7 +115,7 @@ est_io est_port_io(est_port *self, can_port_t *port) {
         };
         (void)can_port_filter(port, wanted, sizeof wanted / sizeof wanted[0]);
     }
-    const est_io io = {self, begin, receive, transmit, counters};
+    const est_io io = {self, begin, receive, transmit, counters, wait_until};
     return io;
 }
 

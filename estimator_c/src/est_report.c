@@ -31,8 +31,8 @@ void est_report_ready(FILE *out, const est_report_identity *identity) {
     } else {
         (void)fputs("null", out);
     }
-    (void)fprintf(out, ",\"mlock\":%s,\"locked_kb\":%" PRId64 ",\"period_us\":%" PRId64 ",\"setting\":", boolean(granted->mlock),
-                  granted->locked_kb, identity->period_us);
+    (void)fprintf(out, ",\"mlock\":%s,\"locked_kb\":%" PRId64 ",\"period_us\":%" PRId64 ",\"canary\":\"%s\",\"setting\":",
+                  boolean(granted->mlock), granted->locked_kb, identity->period_us, identity->canary);
     put_string(out, identity->setting);
     (void)fprintf(out, ",\"weights_hash\":\"%s\",\"dbc_hash\":\"%s\",\"build_hash\":\"%s\",\"warnings\":[",
                   identity->weights_sha256, identity->dbc_sha256, identity->build_sha256);
@@ -80,12 +80,11 @@ static void put_metrics(FILE *out, const rt_stats stats[RT_METRICS]) {
     }
 }
 
-static void put_last_second(FILE *out, const rt_task *task, rt_stats *scratch) {
+static void put_last_second(FILE *out, const est_cycle *cycle, rt_stats *scratch) {
     /* The window ends with the last release that ran. */
-    const int64_t last_ns = task->config.t0_ns + (int64_t)task->last_index * task->config.period_ns;
     for (size_t i = 0; i < RT_METRICS; i++) {
         rt_summary summary;
-        rt_recent_summary(&task->recent[i], last_ns, NS_PER_S, scratch, &summary);
+        rt_recent_summary(&cycle->task.recent[i], cycle->last_release_ns, NS_PER_S, scratch, &summary);
         (void)fputs(i > 0 ? "," : "", out);
         put_summary(out, rt_metric_name[i], &summary);
     }
@@ -94,8 +93,63 @@ static void put_last_second(FILE *out, const rt_task *task, rt_stats *scratch) {
 static void put_tally(FILE *out, const rt_tally *t) {
     (void)fprintf(out,
                   "\"releases\":%" PRIu64 ",\"jobs\":%" PRIu64 ",\"miss_late\":%" PRIu64 ",\"miss_skipped\":%" PRIu64
-                  ",\"overrun\":%" PRIu64 ",\"consec_miss_max\":%" PRIu64 ",\"mk_worst\":%" PRIu64,
-                  t->releases, t->jobs, t->miss_late, t->miss_skipped, t->overrun, t->consec_miss_max, t->mk_worst);
+                  ",\"overrun\":%" PRIu64 ",\"consec_miss_max\":%" PRIu64 ",\"mk_worst\":%" PRIu64 ",\"queued\":%" PRIu64
+                  ",\"queued_now\":%" PRIu64,
+                  t->releases, t->jobs, t->miss_late, t->miss_skipped, t->overrun, t->consec_miss_max, t->mk_worst, t->queued,
+                  t->queued_now);
+}
+
+static void put_histogram(FILE *out, const rt_stats *stats) {
+    const char *comma = "";
+    (void)fprintf(out, "{\"count\":%" PRIu64, stats->count);
+    if (stats->count > 0) {
+        (void)fprintf(out,
+                      ",\"min_ns\":%" PRId64 ",\"min_index\":%" PRIu64 ",\"max_ns\":%" PRId64 ",\"max_index\":%" PRIu64
+                      ",\"mean_ns\":%.3f,\"std_ns\":",
+                      stats->min_ns, stats->min_index, stats->max_ns, stats->max_index, stats->mean_ns);
+        rt_summary summary;
+        rt_stats_summary(stats, &summary);
+        (void)fprintf(out, stats->count > 1 ? "%.3f" : "null", summary.std_ns);
+    } else {
+        (void)fputs(",\"min_ns\":null,\"min_index\":null,\"max_ns\":null,\"max_index\":null,\"mean_ns\":null,\"std_ns\":null", out);
+    }
+    (void)fprintf(out, ",\"underflow\":%" PRIu64 ",\"overflow\":%" PRIu64 ",\"buckets\":[", stats->underflow, stats->overflow);
+    for (size_t i = 0; i < RT_STATS_BUCKETS; i++) {
+        int64_t low_ns = 0;
+        int64_t high_ns = 0;
+        if (stats->bucket[i] > 0) {
+            rt_stats_bucket_bounds(i, &low_ns, &high_ns);
+            (void)fprintf(out, "%s[%" PRId64 ",%" PRId64 ",%" PRIu64 "]", comma, low_ns, high_ns, stats->bucket[i]);
+            comma = ",";
+        }
+    }
+    (void)fputs("]}", out);
+}
+
+static void put_histograms(FILE *out, const char *name, const rt_stats stats[RT_METRICS]) {
+    (void)fprintf(out, "\"%s\":{", name);
+    for (size_t i = 0; i < RT_METRICS; i++) {
+        (void)fprintf(out, "%s\"%s\":", i > 0 ? "," : "", rt_metric_name[i]);
+        put_histogram(out, &stats[i]);
+    }
+    (void)fputc('}', out);
+}
+
+/* What the policy did, and the (m, K) monitor of the judged releases (null without one). */
+static void put_reaction(FILE *out, const est_cycle *cycle) {
+    const rt_task *task = &cycle->task;
+    (void)fprintf(out,
+                  ",\"cut\":%" PRIu64 ",\"rebased\":%" PRIu64 ",\"phase_us\":%.3f,\"migrations\":%" PRIu64
+                  ",\"outputs\":{\"computed\":%" PRIu64 ",\"held\":%" PRIu64 ",\"predicted\":%" PRIu64 ",\"invalid\":%" PRIu64 "}",
+                  task->cut_jobs, task->rebased, (double)task->phase_ns * 1e-3, task->migrations,
+                  cycle->output_jobs[TIMING_OUTPUT_COMPUTED], cycle->output_jobs[TIMING_OUTPUT_HELD],
+                  cycle->output_jobs[TIMING_OUTPUT_PREDICTED], cycle->output_jobs[TIMING_OUTPUT_INVALID]);
+    if (task->config.mk_k > 0) {
+        (void)fprintf(out, ",\"mk\":{\"m\":%" PRIu32 ",\"k\":%" PRIu32 ",\"worst\":%" PRIu64 ",\"violations\":%" PRIu64 "}",
+                      task->config.mk_m, task->config.mk_k, task->judged.mk_misses_max, task->judged.mk_violations);
+    } else {
+        (void)fputs(",\"mk\":null", out);
+    }
 }
 
 static void put_rx(FILE *out, const est_rx *rx, const char *name) {
@@ -152,8 +206,6 @@ static void put_list(FILE *out, const char *name, const uint64_t *values, const 
 }
 
 void est_report_final(FILE *out, const est_cycle *cycle, const est_report_run *run, rt_stats *scratch) {
-    static const char *const cause_names[] = {"none",         "late_wake",   "preempted",
-                                              "long_compute", "stale_input", "blocked_send"};
     static const char *const status_names[] = {"init", "starting", "ok", "predicting",
                                                "input_stale", "invalid", "open_loop", "fallback"};
     est_counters counters;
@@ -171,7 +223,10 @@ void est_report_final(FILE *out, const est_cycle *cycle, const est_report_run *r
                   ",\"frames_sent\":%" PRIu64,
                   counters.crc_errors, counters.seq_errors, counters.stale_inputs, counters.rx_drops, counters.tx_drops,
                   counters.rejected, io.error_frames, cycle->bus.foreign, io.received, io.sent);
-    put_list(out, "causes", cycle->task.causes, cause_names, sizeof cause_names / sizeof cause_names[0]);
+    put_reaction(out, cycle);
+    put_list(out, "causes", cycle->task.causes, rt_cause_name, RT_CAUSES);
+    put_list(out, "skipped_causes", cycle->task.skipped_causes, rt_cause_name, RT_CAUSES);
+    put_list(out, "judged_causes", cycle->task.judged_causes, rt_cause_name, RT_CAUSES);
     put_list(out, "status_jobs", cycle->status_jobs, status_names, sizeof status_names / sizeof status_names[0]);
     put_estimator(out, &cycle->estimator.counters);
     (void)fputc(',', out);
@@ -183,7 +238,7 @@ void est_report_final(FILE *out, const est_cycle *cycle, const est_report_run *r
     (void)fputc(',', out);
     put_metrics(out, cycle->task.warmup_stats);
     (void)fputs("},\"last_second\":{", out);
-    put_last_second(out, &cycle->task, scratch);
+    put_last_second(out, cycle, scratch);
     (void)fputs("},\"rx\":{", out);
     put_rx(out, &cycle->bus.rx[EST_RX_MOTOR_STATE], drive_messages[DRIVE_INDEX_MOTOR_STATE].name);
     (void)fputc(',', out);
@@ -192,6 +247,10 @@ void est_report_final(FILE *out, const est_cycle *cycle, const est_report_run *r
     put_rx(out, &cycle->bus.rx[EST_RX_COOLANT], drive_messages[DRIVE_INDEX_COOLANT].name);
     (void)fputc('}', out);
     put_environment(out, run);
-    (void)fputs("}\n", out);
+    (void)fputs(",\"histograms\":{", out);
+    put_histograms(out, "warmup", cycle->task.warmup_stats);
+    (void)fputc(',', out);
+    put_histograms(out, "judged", cycle->task.stats);
+    (void)fputs("}}\n", out);
     (void)fflush(out);
 }

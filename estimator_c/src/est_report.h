@@ -15,6 +15,7 @@ typedef struct {
     const char *dbc_sha256;
     const char *build_sha256;
     int64_t period_us;
+    const char *canary;       /* "none", "shown" (not above the job: nothing is blamed on the machine for it), "conclusive" */
     const rt_granted *granted;
 } est_report_identity;
 
@@ -23,14 +24,15 @@ typedef struct {
     rt_environment warm;      /* after warm-up */
     rt_environment end;
     bool warm_valid;          /* the run was longer than its warm-up */
-    const char *stopped_by;   /* "signal", "end", "bus", "input" */
+    const char *stopped_by;   /* "signal", "end", "bus", "input", "misses" */
 } est_report_run;
 
 /* {"ready":true,"policy":…,"warnings":[…]} and a newline, flushed. */
 void est_report_ready(FILE *out, const est_report_identity *identity);
 
 /* {"final":true,"jobs":…} and a newline, flushed. Times in µs; null where there are too few samples, or none. The figures
- * at top level are those after warm-up; `scratch` is overwritten. Counters are since start. */
+ * at top level are those after warm-up; `scratch` is overwritten. Counters are since start. "histograms" has every metric of both
+ * windows with its buckets that are not empty, [low_ns, high_ns, count]: tens of kB. */
 void est_report_final(FILE *out, const est_cycle *cycle, const est_report_run *run, rt_stats *scratch);
 
 #endif

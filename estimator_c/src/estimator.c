@@ -200,8 +200,6 @@ void estimator_finish(estimator_t *self)
 static void solve(estimator_t *self, int64_t now, estimator_out_t *out)
 {
     fusion_estimate_t estimate;
-    double rate[MHE_CHANNELS];
-    double tape[NET_TAPE];
     double sum = 0.0;
 
     fusion_solve(&self->fusion, &estimate);
@@ -211,12 +209,7 @@ static void solve(estimator_t *self, int64_t now, estimator_out_t *out)
     out->kkt_degc = estimate.kkt_degc;
     memcpy(self->theta, estimate.theta, sizeof self->theta);
     memcpy(self->memory, estimate.memory, sizeof self->memory);
-    for (int64_t k = now - self->setting.delay_steps; k < now; k++) {
-        net_forward(self->input[estimator_slot(k)], self->theta, self->memory, self->memory, rate, tape);
-        for (int ch = 0; ch < MHE_CHANNELS; ch++) {
-            self->theta[ch] += NET_DT_S * rate[ch];
-        }
-    }
+    estimator_run_forward(self, now - self->setting.delay_steps, now, self->theta, self->memory);
     for (int ch = 0; ch < MHE_CHANNELS; ch++) {
         self->variance[ch] = estimate.variance[ch];
         sum += self->theta[ch] + self->variance[ch];
@@ -279,4 +272,11 @@ void estimator_step(estimator_t *self, estimator_out_t *out)
     self->invalid_pending = false;
     self->innovation[0] = NAN;
     self->innovation[1] = NAN;
+}
+
+void estimator_step_within(estimator_t *self, estimator_out_t *out, bool (*expired)(void *ctx), void *ctx)
+{
+    fusion_limit(&self->fusion, expired, ctx); /* lost where the estimator begins anew: then it solves one window */
+    estimator_step(self, out);
+    fusion_limit(&self->fusion, NULL, NULL);
 }

@@ -125,6 +125,15 @@ typedef struct {
     bool newest_held;                  /* the newest consumed interval had no frame */
 } estimator_t;
 
+/* Where a prediction starts: the solution at the newest grid node before a step. */
+typedef struct {
+    bool known;                        /* false: there is none */
+    uint32_t restarts;
+    int64_t next_interval;
+    double theta[MHE_CHANNELS];
+    double memory[NET_MEMORY];
+} estimator_base_t;
+
 /* Start empty with a copy of `setting`. < 5 us. ESTIMATOR_BAD_SETTING leaves the object unusable. */
 estimator_error_t estimator_init(estimator_t *self, const est_setting_t *setting);
 
@@ -145,6 +154,20 @@ void estimator_feed_coolant(estimator_t *self, double coolant_degc, bool soaked,
  * mhe_solve() and delay_steps net steps; without a completed interval at most one net step, or one re-solve when a
  * measurement arrived after its interval had been consumed. Never fails: trouble is in out->status. */
 void estimator_step(estimator_t *self, estimator_out_t *out);
+
+/* The same, with the MHE asking `expired` between sweeps whether its time is up: then it ends with the iterate it has,
+ * after at least one sweep for each interval; where that is not good enough the Kalman filter stands in (status
+ * ESTIMATOR_FALLBACK). NULL: no limit. */
+void estimator_step_within(estimator_t *self, estimator_out_t *out, bool (*expired)(void *ctx), void *ctx);
+
+/* Where estimator_predict() would start from now. < 0.1 us. */
+void estimator_base(const estimator_t *self, estimator_base_t *base);
+
+/* After a step: what the net alone gives for out->tick from `base`, taken before that step, without what the step made
+ * of the measurements. Moves the temperatures and upper bounds of `out` there, with status ESTIMATOR_PREDICTING. False,
+ * `out` untouched: there was nothing to start from, or the estimator began anew in that step. Cost: one net step for
+ * each interval since, and one. */
+bool estimator_predict(const estimator_t *self, const estimator_base_t *base, estimator_out_t *out);
 
 /* After publishing: in mode feedback the rest of the last solution, as long as mhe_solve() takes; else nothing. Never
  * fails. */

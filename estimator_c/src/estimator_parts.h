@@ -1,5 +1,5 @@
-/* What estimator.c (start, steps), estimator_feed.c (frames in) and estimator_publish.c (what is said) share; for
- * these three alone. Nothing here fails; cost as said, threads and memory as in estimator.h. */
+/* What estimator.c (start, steps), estimator_feed.c (frames in), estimator_publish.c (what is said) and
+ * estimator_predict.c (what is said when that is too late) share; for these four alone. Nothing here fails; cost as said, threads and memory as in estimator.h. */
 #ifndef ESTIMATOR_PARTS_H
 #define ESTIMATOR_PARTS_H
 
@@ -22,6 +22,15 @@ void estimator_forget_measured(estimator_t *self);
 
 /* A measurement for the newest node, offset removed. Cost of fusion_measure(). */
 void estimator_measure(estimator_t *self, int channel, double y);
+
+/* Move theta and the net's memory from node `from` to node `to` with the stored inputs. One net step per node. */
+void estimator_run_forward(const estimator_t *self, int64_t from, int64_t to, double theta[MHE_CHANNELS],
+                           double memory[NET_MEMORY]);
+
+/* Theta at the newest motor frame, from theta and the net's memory at the newest grid node: moved by the rate for the
+ * frames since. At most one net step. */
+void estimator_publish_theta(const estimator_t *self, const double node[MHE_CHANNELS], const double before[NET_MEMORY],
+                             estimator_out_t *out);
 
 /* Fill in what is known now: all of *out but the ticks and what the steps' solutions said. At most one net step. */
 void estimator_publish(const estimator_t *self, estimator_out_t *out);

@@ -7,11 +7,11 @@ static const double MODEL_VARIANCE = 0.01; /* K^2: a plant not quite the one the
 static const double START_VARIANCE = 0.09; /* the same while the net's memory is still filling */
 static const int32_t START_STEPS = 200;
 
-/* The estimate at the newest motor frame: the grid node's, moved by the rate for the frames since. */
-static void publish_theta(const estimator_t *self, estimator_out_t *out)
+void estimator_publish_theta(const estimator_t *self, const double node[MHE_CHANNELS], const double before[NET_MEMORY],
+                             estimator_out_t *out)
 {
     const int64_t since = self->newest_tick - self->grid_tick - ESTIMATOR_TICKS * self->next_interval;
-    double theta[MHE_CHANNELS] = {self->theta[0], self->theta[1]};
+    double theta[MHE_CHANNELS] = {node[0], node[1]};
     if (since > 0) {
         const estimator_bin_t *bin = &self->bin[estimator_slot(self->next_interval)];
         double input[2] = {self->held_input[0], self->held_input[1]};
@@ -22,7 +22,7 @@ static void publish_theta(const estimator_t *self, estimator_out_t *out)
             input[0] = bin->speed_sum / bin->frames;
             input[1] = bin->torque_sum / bin->frames;
         }
-        net_forward(input, theta, self->memory, memory, rate, tape);
+        net_forward(input, theta, before, memory, rate, tape);
         for (int ch = 0; ch < MHE_CHANNELS; ch++) {
             theta[ch] += rate[ch] * ESTIMATOR_TICK_S * (double)since;
         }
@@ -74,7 +74,7 @@ static estimator_status_t status_now(const estimator_t *self)
 void estimator_publish(const estimator_t *self, estimator_out_t *out)
 {
     if (self->started) {
-        publish_theta(self, out);
+        estimator_publish_theta(self, self->theta, self->memory, out);
         out->channel[0] = channel_now(self, 0, out->theta_w_degc);
         out->channel[1] = channel_now(self, 1, out->theta_r_degc);
     }

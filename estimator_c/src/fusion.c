@@ -1,6 +1,7 @@
 #include "fusion.h"
 
 #include <math.h>
+#include <stddef.h>
 #include <string.h>
 
 static const int32_t MEMORY_STEPS = 200;      /* 20 s: so long the filter learns what the net should remember */
@@ -235,12 +236,24 @@ static bool solve_window(fusion_t *self, mhe_status_t *status)
     if (self->setting.supervise) {
         weigh(self);
     }
-    *status = feedback ? mhe_feedback(&self->mhe, result) : mhe_solve(&self->mhe, result);
+    if (feedback) {
+        *status = mhe_feedback(&self->mhe, result);
+    } else if (self->expired != NULL) {
+        *status = mhe_solve_within(&self->mhe, result, self->expired, self->expired_ctx);
+    } else {
+        *status = mhe_solve(&self->mhe, result);
+    }
     const bool cut_short = *status == MHE_MAX_SWEEPS;
     const bool solved = *status == MHE_OK || (cut_short && result->kkt_degc < left_degc);
     self->unfinished = feedback && cut_short;
     *status = self->unfinished ? MHE_OK : *status;
     return solved;
+}
+
+void fusion_limit(fusion_t *self, bool (*expired)(void *ctx), void *ctx)
+{
+    self->expired = expired;
+    self->expired_ctx = ctx;
 }
 
 void fusion_solve(fusion_t *self, fusion_estimate_t *estimate)

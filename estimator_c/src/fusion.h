@@ -37,6 +37,8 @@ typedef struct {
     mhe_result_t result;         /* of the last solution */
     bool unfinished;             /* mode feedback: fusion_finish() has something to do */
     bool fallback;               /* the last estimate is the EKF's in place of the MHE's */
+    bool (*expired)(void *ctx);  /* NULL: no limit; see fusion_limit() */
+    void *expired_ctx;
 } fusion_t;
 
 /* The estimate at the newest node. */
@@ -71,6 +73,10 @@ double fusion_measure(fusion_t *self, int channel, double y, double raw, double 
 /* A value for a node `age` > 0 steps back, later than the next value. It enters the MHE's window if the monitor would
  * have let it, not the filter. Returns the innovation; NAN: too late, or no MHE. */
 double fusion_measure_late(fusion_t *self, int age, int channel, double y, double raw);
+
+/* From now on fusion_solve() has the MHE ask `expired` between sweeps whether to end (mhe_solve_within). NULL, as after
+ * fusion_init(): no limit. Mode feedback does one sweep anyhow. */
+void fusion_limit(fusion_t *self, bool (*expired)(void *ctx), void *ctx);
 
 /* Solve and give the estimate at the newest node; in mode feedback, after one sweep. */
 void fusion_solve(fusion_t *self, fusion_estimate_t *estimate);

@@ -1,5 +1,6 @@
 #include "mhe.h"
 
+#include <stddef.h>
 #include <string.h>
 
 #include "mhe_loss.h"
@@ -344,23 +345,34 @@ mhe_status_t mhe_feedback(mhe_t *self, mhe_result_t *result)
     return conclude(self, result);
 }
 
-mhe_status_t mhe_finish(mhe_t *self, mhe_result_t *result)
+static mhe_status_t finish(mhe_t *self, mhe_result_t *result, bool (*expired)(void *ctx), void *ctx)
 {
     if (self->count == 0) {
         return MHE_INVALID;
     }
     refresh(self);
-    while (!self->converged && result->sweeps < self->max_sweeps) {
+    while (!self->converged && result->sweeps < self->max_sweeps &&
+           (expired == NULL || !expired(ctx))) {
         sweep(self, result);
         refresh(self);
     }
     return conclude(self, result);
 }
 
+mhe_status_t mhe_finish(mhe_t *self, mhe_result_t *result)
+{
+    return finish(self, result, NULL, NULL);
+}
+
 mhe_status_t mhe_solve(mhe_t *self, mhe_result_t *result)
 {
+    return mhe_solve_within(self, result, NULL, NULL);
+}
+
+mhe_status_t mhe_solve_within(mhe_t *self, mhe_result_t *result, bool (*expired)(void *ctx), void *ctx)
+{
     const mhe_status_t status = mhe_feedback(self, result);
-    return status == MHE_INVALID ? status : mhe_finish(self, result);
+    return status == MHE_INVALID ? status : finish(self, result, expired, ctx);
 }
 
 real_t mhe_cost(mhe_t *self, real_t gradient[][MHE_CHANNELS])

@@ -114,6 +114,10 @@ void mhe_shift(mhe_t *self, int channel, real_t shift);
  * mhe_finish(). */
 mhe_status_t mhe_solve(mhe_t *self, mhe_result_t *result);
 
+/* mhe_solve() that asks `expired` before each sweep but the first: once it says true, the iterate so far is the result
+ * (MHE_MAX_SWEEPS; its kkt_degc tells how good it is). */
+mhe_status_t mhe_solve_within(mhe_t *self, mhe_result_t *result, bool (*expired)(void *ctx), void *ctx);
+
 /* The estimate after the first sweep alone: one adjoint pass and one solve, no forward pass. MHE_MAX_SWEEPS: there is
  * more to do, and mhe_finish() with the same result, after publishing, does it and returns what mhe_solve() would
  * have. Until then the memory in the window's nodes is that of before the sweep. Without mhe_finish() the next

@@ -1,11 +1,12 @@
-/* LD_PRELOAD: counts heap calls and page faults between the sleeps of a loop; written to $MALLOC_COUNTER at exit.
+/* LD_PRELOAD: counts heap calls between the sleeps of the main thread's loop; written to $MALLOC_COUNTER at exit.
  *
- * The line is "SLEEPS ALLOCATIONS": allocations made after the first SETTLE sleeps and before the last one. */
+ * The line is "SLEEPS ALLOCATIONS": allocations made, by any thread, after the first SETTLE sleeps and before the last one. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <time.h>
+#include <unistd.h>
 
 extern void *__libc_malloc(size_t size);
 extern void *__libc_calloc(size_t count, size_t size);
@@ -37,11 +38,13 @@ int clock_nanosleep(clockid_t clock, int flags, const struct timespec *at, struc
     if (real == NULL) {
         real = (int (*)(clockid_t, int, const struct timespec *, struct timespec *))dlsym(RTLD_NEXT, "clock_nanosleep");
     }
-    sleeps++;
-    if (sleeps == SETTLE) {
-        at_settle = calls;
+    if (gettid() == getpid()) { /* the canary sleeps on, before the loop and after it */
+        sleeps++;
+        if (sleeps == SETTLE) {
+            at_settle = calls;
+        }
+        at_last = calls;
     }
-    at_last = calls;
     return real(clock, flags, at, left);
 }
 
