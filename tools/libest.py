@@ -21,7 +21,7 @@ from rt_runner.errors import SetupError
 
 ROOT = Path(__file__).resolve().parents[1]
 CORE = ("mhe", "mhe_loss", "ekf", "slow_observer", "sensor_monitor", "fusion", "offset_calibration", "validity",
-        "estimator", "estimator_feed", "estimator_publish")  # fmt: skip
+        "estimator", "estimator_feed", "estimator_predict", "estimator_publish")  # fmt: skip
 MHE = ("src/mhe.c", "src/mhe_loss.c")
 SOLVER = tuple(f"src/solver/{name}.c" for name in ("tridiag", "tridiag_pair", "box_qp"))
 SOURCES = (*(f"src/{name}.c" for name in CORE), "src/est_batch.c", *SOLVER)
