@@ -1,8 +1,8 @@
-/* What the real-time runtime adds to a job: bench_rt CLOCK WORK_KB JOBS
- * CLOCK counted: the clock costs nothing (the accounting alone); system: the clocks of the real loop. WORK_KB of memory are walked
- * through between the calls of a job, as the job itself would (0: the accounting stays in the caches). The sleep takes no time, but
- * the clock leaps to the release, so that every job starts 30 µs late and is in time; the canary woke twice.
- * Prints "jobs median_ns p99_ns": the time in the four calls, less what two looks at the clock take. Instructions: callgrind with
+/* What the real-time runtime adds to a job: bench_rt CLOCK WORK_KB JOBS CLOCK counted: the clock costs nothing (the
+ * accounting alone); system: the clocks of the real loop. WORK_KB of memory are walked through between the calls of
+ * a job, as the job itself would (0: the accounting stays in the caches). The sleep takes no time, but the clock
+ * leaps to the release, so that every job starts 30 µs late and is in time; the canary woke twice. Prints "jobs
+ * median_ns p99_ns": the time in the four calls, less what two looks at the clock take. Instructions: callgrind with
  * --toggle-collect=timed_job. */
 #include <stdio.h>
 #include <stdlib.h>
@@ -108,7 +108,8 @@ int main(int argc, char **argv) {
     }
     real = rt_clock_system();
     const rt_clock clock = {NULL, now, cpu, leap, core};
-    const rt_task_config config = {.period_ns = 1000000, .deadline_ns = 1000000, .warmup_releases = 5, .mk_m = 1, .mk_k = 100};
+    const rt_task_config config = {
+        .period_ns = 1000000, .deadline_ns = 1000000, .warmup_releases = 5, .mk_m = 1, .mk_k = 100};
     if (rt_task_init(&task, &config, &clock) != RT_TASK_OK) {
         return 2;
     }
@@ -116,7 +117,8 @@ int main(int argc, char **argv) {
     memset(memory, 1, sizeof memory);
     for (int i = 0; i < jobs; i++) {
         const int64_t due_ns = rt_task_next_release_ns(&task) - config.period_ns / 4;
-        rt_canary_ring_push(&ring, (rt_canary_record){due_ns - config.period_ns / 2, due_ns - config.period_ns / 2 + LATE_NS});
+        const int64_t before_ns = due_ns - config.period_ns / 2;
+        rt_canary_ring_push(&ring, (rt_canary_record){before_ns, before_ns + LATE_NS});
         rt_canary_ring_push(&ring, (rt_canary_record){due_ns, due_ns + LATE_NS});
         timed_job(bytes, &cost_ns[i]);
     }

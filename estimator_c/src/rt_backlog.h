@@ -1,4 +1,5 @@
-/* The releases that wait while a job overruns (policy queue:N), oldest first, each with the releases skipped right behind it.
+/* The releases that wait while a job overruns (policy queue:N), oldest first, each with the releases skipped right
+ * behind it.
  *
  * Pure bookkeeping in fixed memory; all functions are O(1) and cannot fail unless they say so. One thread. */
 #ifndef RT_BACKLOG_H

@@ -13,7 +13,7 @@ void rt_canary_ring_init(rt_canary_ring *self) {
 }
 
 void rt_canary_ring_push(rt_canary_ring *self, rt_canary_record record) {
-    const uint64_t read = __atomic_load_n(&self->read, __ATOMIC_ACQUIRE); /* the slot is free only when its reader is done */
+    const uint64_t read = __atomic_load_n(&self->read, __ATOMIC_ACQUIRE); /* the slot is free when its reader is done */
     if (self->written - read == RT_CANARY_RING) {
         __atomic_store_n(&self->lost, self->lost + 1U, __ATOMIC_RELAXED);
         return;
@@ -118,15 +118,16 @@ void rt_canary_start(rt_canary *self, int64_t period_ns, rt_granted *job) {
     (void)sem_init(&self->aimed, 0, 0);
     const int error = create(self);
     if (error != 0) {
-        rt_grant_warn(job, "no canary thread (%s): time stolen by the machine is not told apart from other causes", strerror(error));
+        rt_grant_warn(job, "no canary thread (%s): time stolen by the machine is not told apart from other causes",
+                      strerror(error));
         return;
     }
     self->running = wait_for(&self->granted);
-    self->conclusive = real_time && self->policy == RT_POLICY_FIFO && self->priority > job->priority && job->core >= 0 &&
-                       self->core == job->core;
+    const bool above = self->policy == RT_POLICY_FIFO && self->priority > job->priority;
+    self->conclusive = real_time && above && job->core >= 0 && self->core == job->core;
     if (real_time && !self->conclusive) {
-        rt_grant_warn(job, "canary is not above the job on its core (priority %d and %d, core %d and %d; -1: any): nothing is "
-                      "blamed on the machine", self->priority, job->priority, self->core, job->core);
+        rt_grant_warn(job, "canary is not above the job on its core (priority %d and %d, core %d and %d; -1: any): "
+                      "nothing is blamed on the machine", self->priority, job->priority, self->core, job->core);
     }
 }
 

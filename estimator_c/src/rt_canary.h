@@ -1,13 +1,14 @@
 /* The canary: a thread that does nothing but wake up, on the core of the job and one priority above it.
  *
- * Our own work never delays it, however long it takes; only the machine does (the hypervisor took the core, or the kernel held it).
- * So when it woke late, the core was not ours from `due` to `woke`, and a job that was late over the same time is excused.
- * It wakes twice a period, at r + T/4 and r + 3T/4: not on the releases, where it would delay the job; a theft it does not see
- * is shorter than T/2. At T = 1 ms that is 2000 wake-ups a second of a few microseconds each, less than 1 % of the core.
+ * Our own work never delays it, however long it takes; only the machine does (the hypervisor took the core, or the
+ * kernel held it). So when it woke late, the core was not ours from `due` to `woke`, and a job that was late over
+ * the same time is excused. It wakes twice a period, at r + T/4 and r + 3T/4: not on the releases, where it would
+ * delay the job; a theft it does not see is shorter than T/2. At T = 1 ms that is 2000 wake-ups a second of a few
+ * microseconds each, less than 1 % of the core.
  *
- * Its records go through a ring of one writer and one reader, without locks. Where the thread cannot be raised above the job
- * (no SCHED_FIFO, priority 99, no core of its own) it runs all the same, in the same class, and is not `conclusive`: its
- * figures are shown, but nothing is blamed on the machine for them. */
+ * Its records go through a ring of one writer and one reader, without locks. Where the thread cannot be raised above
+ * the job (no SCHED_FIFO, priority 99, no core of its own) it runs all the same, in the same class, and is not
+ * `conclusive`: its figures are shown, but nothing is blamed on the machine for them. */
 #ifndef RT_CANARY_H
 #define RT_CANARY_H
 
@@ -44,7 +45,8 @@ void rt_canary_ring_push(rt_canary_ring *self, rt_canary_record record);
 /* Writer: it sleeps until `due_ns` from here on. O(1). */
 void rt_canary_ring_arm(rt_canary_ring *self, int64_t due_ns);
 
-/* Reader: what the canary sleeps for, or slept for if it has not run yet although that is past; INT64_MAX before the first. O(1). */
+/* Reader: what the canary sleeps for, or slept for if it has not run yet although that is past; INT64_MAX before the
+ * first. O(1). */
 int64_t rt_canary_ring_due(const rt_canary_ring *self);
 
 /* Reader: O(1), never waits. False when there is none. */
@@ -71,9 +73,9 @@ typedef struct {
     bool stop;
 } rt_canary;
 
-/* Starts the thread, which then waits for its grid. `job` is what the job's thread was granted: same class, same core, priority
- * one above. What could not be had is a warning in `job`; without a thread `running` is false and everything else
- * works. Takes about 1 ms; set-up only (allocates a stack of 64 kB). `self` must outlive the thread. */
+/* Starts the thread, which then waits for its grid. `job` is what the job's thread was granted: same class, same
+ * core, priority one above. What could not be had is a warning in `job`; without a thread `running` is false and
+ * everything else works. Takes about 1 ms; set-up only (allocates a stack of 64 kB). `self` must outlive the thread. */
 void rt_canary_start(rt_canary *self, int64_t period_ns, rt_granted *job);
 
 /* The grid begins at `t0_ns`, the job's r_0. Once. O(1). */

@@ -1,12 +1,14 @@
 /* Why a job's output was not what it should be: pure rules over measured times, the same for every process.
  *
- * The delay of a job, from its release to the end of its output, has five parts, in order of time: it waited for an earlier job
- * (backlog), the system woke it late, it was off the processor while computing, it computed, it sent. A late job is blamed
- *   1. on `steal`, when it would have been in time without what the canary saw taken from the core (resp - stolen <= D);
+ * The delay of a job, from its release to the end of its output, has five parts, in order of time: it waited for an
+ * earlier job (backlog), the system woke it late, it was off the processor while computing, it computed, it sent. A
+ * late job is blamed
+ *   1. on `steal`, when it would have been in time without what the canary saw taken from the core (resp - stolen <=
+ *   D);
  *   2. else on the largest part; of equal ones the earliest. Backlog hands on the cause of the job it waited for.
- * Processor time of a thread may contain time the hypervisor took (the guest does not see all of it), so that theft looks
- * like a late wake, preemption, long compute or blocked send alike: hence rule 1 before rule 2. What the canary saw is a lower bound, hence
- * a miss without evidence is never steal.
+ * Processor time of a thread may contain time the hypervisor took (the guest does not see all of it), so that theft
+ * looks like a late wake, preemption, long compute or blocked send alike: hence rule 1 before rule 2. What the
+ * canary saw is a lower bound, hence a miss without evidence is never steal.
  *
  * No clock, no state. O(1), any thread, cannot fail. */
 #ifndef RT_CAUSE_H
@@ -42,7 +44,8 @@ typedef struct {
 /* The largest part's cause. */
 rt_cause rt_cause_largest(const rt_delay *delay);
 
-/* The cause of a late job; `stolen_ns` is what the canary saw taken between release and publication, 0 without a canary. */
+/* The cause of a late job; `stolen_ns` is what the canary saw taken between release and publication, 0 without a
+ * canary. */
 rt_cause rt_cause_late(const rt_delay *delay, int64_t resp_ns, int64_t deadline_ns, int64_t stolen_ns);
 
 #endif

@@ -1,6 +1,7 @@
 /* The clocks a real-time task reads, as a table of functions so that a test can script every delay.
  *
- * All times are int64 nanoseconds. The functions of the system clock allocate nothing and may be called from any thread. */
+ * All times are int64 nanoseconds. The functions of the system clock allocate nothing and may be called from any
+ * thread. */
 #ifndef RT_CLOCK_H
 #define RT_CLOCK_H
 
@@ -15,7 +16,8 @@ typedef struct {
     int (*cpu)(void *ctx);                             /* the core the caller runs on, -1: unknown; NULL: not asked */
 } rt_clock;
 
-/* CLOCK_MONOTONIC, CLOCK_THREAD_CPUTIME_ID, clock_nanosleep with an absolute time, sched_getcpu. Cannot fail on Linux. */
+/* CLOCK_MONOTONIC, CLOCK_THREAD_CPUTIME_ID, clock_nanosleep with an absolute time, sched_getcpu. Cannot fail on
+ * Linux. */
 rt_clock rt_clock_system(void);
 
 /* CLOCK_REALTIME, the clock of the kernel's receive stamps. About 30 ns. */

@@ -121,7 +121,8 @@ static void read_back(const rt_request *request, const answers *yes, rt_granted 
     granted->locked_kb = proc_number("/proc/self/status", "VmLck:");
     granted->mlock = yes->lock && granted->locked_kb > 0;
     if (yes->lock && !granted->mlock) {
-        rt_grant_warn(granted, "mlockall succeeded but VmLck is %lld kB: memory is not locked", (long long)granted->locked_kb);
+        rt_grant_warn(granted, "mlockall succeeded but VmLck is %lld kB: memory is not locked",
+                      (long long)granted->locked_kb);
     }
     if (yes->policy && (granted->policy != RT_POLICY_FIFO || granted->priority != request->priority)) {
         rt_grant_warn(granted, "SCHED_FIFO priority %d was granted, but the system reports policy %s, priority %d",
@@ -143,8 +144,8 @@ static answers raise_thread(const rt_request *request, rt_granted *granted) {
         const struct sched_param param = {.sched_priority = request->priority};
         yes.policy = sched_setscheduler(0, SCHED_FIFO, &param) == 0;
         if (!yes.policy) {
-            rt_grant_warn(granted, "SCHED_FIFO priority %d refused (%s): needs CAP_SYS_NICE or an rtprio limit; wake-ups will be later",
-                 request->priority, strerror(errno));
+            rt_grant_warn(granted, "SCHED_FIFO priority %d refused (%s): needs CAP_SYS_NICE or an rtprio limit; "
+                          "wake-ups will be later", request->priority, strerror(errno));
         }
     }
     (void)prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL); /* 50 µs by default outside SCHED_FIFO */
@@ -164,8 +165,8 @@ void rt_grant_apply(const rt_request *request, rt_granted *granted) {
     if (request->real_time) {
         yes.lock = mlockall(MCL_CURRENT | MCL_FUTURE) == 0;
         if (!yes.lock) {
-            rt_grant_warn(granted, "mlockall refused (%s): needs CAP_IPC_LOCK or a larger memlock limit; page faults are possible",
-                 strerror(errno));
+            rt_grant_warn(granted, "mlockall refused (%s): needs CAP_IPC_LOCK or a larger memlock limit; "
+                          "page faults are possible", strerror(errno));
         }
     }
     prefault_stack();

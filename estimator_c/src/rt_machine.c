@@ -116,7 +116,8 @@ void rt_machine_start(rt_machine *self, int core, int64_t every_ns) {
     self->run_delay_ns = self->steal_ns = -1;
     self->every_ns = every_ns;
     self->core = core;
-    self->schedstat = open("/proc/thread-self/schedstat", O_RDONLY | O_CLOEXEC); /* stays this thread's, whoever reads it */
+    /* It stays this thread's, whoever reads it. */
+    self->schedstat = open("/proc/thread-self/schedstat", O_RDONLY | O_CLOEXEC);
     self->stat = open("/proc/stat", O_RDONLY | O_CLOEXEC);
     (void)sem_init(&self->stop, 0, 0);
     self->running = create(self);

@@ -23,19 +23,22 @@ typedef enum {
 typedef struct {
     rt_overrun overrun;
     uint32_t queue_limit;  /* RT_OVERRUN_QUEUE: releases that may wait, 1..RT_QUEUE_MAX */
-    int64_t budget_ns;     /* > 0: from the release on, after which rt_task_expired tells the solver to end; 0: no cut */
+    int64_t budget_ns;     /* > 0: time from the release, after which rt_task_expired ends the solver; 0: no cut */
     uint64_t stop_total;   /* > 0: stop after so many judged misses */
     uint64_t stop_row;     /* > 0: stop after so many judged misses in a row */
 } rt_reaction;
 
 /* Reads "skip", "queue:N", "rebase", "cut:BUDGET_US", "stop:total:M" or "stop:row:M" (whole numbers, N 1..RT_QUEUE_MAX,
- * budget 1..10^9 µs, M 1..10^9). cut and stop skip what overruns all the same. False: no such policy, `out` untouched. */
+ * budget 1..10^9 µs, M 1..10^9). cut and stop skip what overruns all the same. False: no such policy, `out`
+ * untouched. */
 bool rt_reaction_parse(const char *text, rt_reaction *out);
 
-/* Reads "m,K" or "m:K": at most m misses in any K consecutive releases, 0 <= m < K <= RT_MK_WINDOW. False: not that, outputs untouched. */
+/* Reads "m,K" or "m:K": at most m misses in any K consecutive releases, 0 <= m < K <= RT_MK_WINDOW. False: not that,
+ * outputs untouched. */
 bool rt_mk_parse(const char *text, uint32_t *m, uint32_t *k);
 
-/* True for a reaction that rt_task takes with this deadline: known overrun policy, queue within its limits, budget <= deadline. */
+/* True for a reaction that rt_task takes with this deadline: known overrun policy, queue within its limits, budget
+ * <= deadline. */
 bool rt_reaction_valid(const rt_reaction *self, int64_t deadline_ns);
 
 #endif

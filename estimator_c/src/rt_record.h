@@ -1,8 +1,8 @@
 /* Lock-step records over a pipe: a CAN frame and its time, 24 bytes, native little endian. Same bytes as
  * rt_runner/records.py.
  *
- * A record whose id is exactly RT_RECORD_CONTROL_ID is a control record; data[0] says which. Nothing here allocates; both
- * ends may block on their pipe. The caller owns the objects; one thread each. */
+ * A record whose id is exactly RT_RECORD_CONTROL_ID is a control record; data[0] says which. Nothing here allocates;
+ * both ends may block on their pipe. The caller owns the objects; one thread each. */
 #ifndef RT_RECORD_H
 #define RT_RECORD_H
 

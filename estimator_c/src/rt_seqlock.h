@@ -1,9 +1,9 @@
 /* Lets other threads read what one thread writes, without ever making the writer wait.
  *
- * The writer makes the number odd, changes its data, makes it even again. A reader copies between two looks at the number and
- * throws its copy away unless both looks gave the same even number: what it read meanwhile may be torn, and is never used.
- * The copy is read with relaxed atomic loads of whole words, so that a torn copy is all that can happen.
- * The writer's cost is two stores; it never waits. A reader repeats and may give up. */
+ * The writer makes the number odd, changes its data, makes it even again. A reader copies between two looks at the
+ * number and throws its copy away unless both looks gave the same even number: what it read meanwhile may be torn,
+ * and is never used. The copy is read with relaxed atomic loads of whole words, so that a torn copy is all that can
+ * happen. The writer's cost is two stores; it never waits. A reader repeats and may give up. */
 #ifndef RT_SEQLOCK_H
 #define RT_SEQLOCK_H
 

@@ -1,9 +1,9 @@
 /* Statistics of a duration in fixed memory: count, min, max, mean, std and quantiles.
  *
- * All values are integer nanoseconds. The histogram is log-linear: values below 64 have a bucket of their own, above that
- * every octave [2^k, 2^(k+1)) is cut into 64 equal buckets up to 2^40 ns (18 minutes). A quantile is the middle of its
- * bucket, so it is at most 1/128 = 0.8 % away from the exact nearest-rank quantile. Negative values are counted as
- * underflow and values from 2^40 on as overflow, never folded into the end buckets.
+ * All values are integer nanoseconds. The histogram is log-linear: values below 64 have a bucket of their own, above
+ * that every octave [2^k, 2^(k+1)) is cut into 64 equal buckets up to 2^40 ns (18 minutes). A quantile is the middle
+ * of its bucket, so it is at most 1/128 = 0.8 % away from the exact nearest-rank quantile. Negative values are
+ * counted as underflow and values from 2^40 on as overflow, never folded into the end buckets.
  *
  * Nothing here allocates, locks, prints or reads a clock. An object belongs to one thread. */
 #ifndef RT_STATS_H
@@ -26,7 +26,7 @@ typedef enum {
     RT_QUANTILE_OK = 0,
     RT_QUANTILE_NA = 1,        /* too few samples: fewer than one is expected beyond the quantile */
     RT_QUANTILE_UNDERFLOW = 2, /* it lies among the negative values: the value given is the minimum, a lower bound */
-    RT_QUANTILE_OVERFLOW = 3   /* it lies among the values from 2^40 ns on: the value given is the maximum, an upper bound */
+    RT_QUANTILE_OVERFLOW = 3   /* it lies among those from 2^40 ns on: the value given is the maximum, an upper bound */
 } rt_quantile_status;
 
 typedef struct {
@@ -35,7 +35,7 @@ typedef struct {
     uint64_t overflow;
     int64_t min_ns;            /* valid when count > 0 */
     int64_t max_ns;
-    uint64_t min_index;        /* `index` given with the first smallest value: a release, or whatever the caller counts */
+    uint64_t min_index;        /* `index` given with the first smallest value: a release, or what the caller counts */
     uint64_t max_index;        /* the same of the first largest value */
     double mean_ns;            /* Welford */
     double m2_ns2;             /* sum of squared deviations */
@@ -86,8 +86,8 @@ rt_quantile_status rt_stats_quantile(const rt_stats *self, uint32_t per_10k, int
 /* What bucket `i` (below RT_STATS_BUCKETS) holds: low <= value < high. O(1). */
 void rt_stats_bucket_bounds(size_t i, int64_t *low_ns, int64_t *high_ns);
 
-/* Adds all values of `other`, as if they had come after those of `self`: of equal extremes the index of `self` stays. Mean and
- * std to rounding (Chan). O(buckets). */
+/* Adds all values of `other`, as if they had come after those of `self`: of equal extremes the index of `self`
+ * stays. Mean and std to rounding (Chan). O(buckets). */
 void rt_stats_merge(rt_stats *self, const rt_stats *other);
 
 /* Everything at once. O(buckets); not meant for the loop. */

@@ -1,8 +1,8 @@
 /* Bookkeeping of releases: what became of every single activation of a periodic task.
  *
- * A release is executed (a job; late or in time), skipped, or waits in the queue; both a late job and a skipped release are a
- * miss. At every instant releases = jobs + miss_skipped + queued_now. Runs and windows of misses are in order of release: a
- * release skipped while an earlier one still waits enters them when that one has run.
+ * A release is executed (a job; late or in time), skipped, or waits in the queue; both a late job and a skipped
+ * release are a miss. At every instant releases = jobs + miss_skipped + queued_now. Runs and windows of misses are
+ * in order of release: a release skipped while an earlier one still waits enters them when that one has run.
  *
  * Nothing here reads a clock, allocates or fails. One thread. */
 #ifndef RT_TALLY_H

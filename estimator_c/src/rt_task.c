@@ -14,7 +14,8 @@ static bool config_valid(const rt_task_config *config) {
     return config->period_ns > 0 && config->deadline_ns > 0 && config->deadline_ns <= config->period_ns &&
            rt_reaction_valid(&config->reaction, config->deadline_ns) &&
            !(config->on_event && config->reaction.overrun != RT_OVERRUN_SKIP) &&
-           config->mk_k <= (uint32_t)RT_MK_WINDOW && (config->mk_m < config->mk_k || (config->mk_m | config->mk_k) == 0);
+           config->mk_k <= (uint32_t)RT_MK_WINDOW &&
+           (config->mk_m < config->mk_k || (config->mk_m | config->mk_k) == 0);
 }
 
 rt_task_status rt_task_init(rt_task *self, const rt_task_config *config, const rt_clock *clock) {
@@ -47,7 +48,7 @@ void rt_task_set_canary(rt_task *self, rt_canary_ring *ring, bool conclusive) {
     self->canary_conclusive = conclusive;
 }
 
-/* ---- grid ----------------------------------------------------------------------------------------------------------- */
+/* ---- grid ------------------------------------------------------------------------------------------------------ */
 
 static int64_t release_of(const rt_task *self, uint64_t index) {
     return self->config.t0_ns + self->phase_ns + (int64_t)index * self->config.period_ns;
@@ -80,7 +81,7 @@ bool rt_task_stopped(const rt_task *self) {
            (reaction->stop_row > 0 && self->judged.consec_miss_max >= reaction->stop_row);
 }
 
-/* ---- a job opens ---------------------------------------------------------------------------------------------------- */
+/* ---- a job opens ----------------------------------------------------------------------------------------------- */
 
 static void note_core(rt_task *self) {
     const int cpu = self->clock.cpu != NULL ? self->clock.cpu(self->clock.ctx) : -1;
@@ -135,7 +136,7 @@ void rt_task_release(rt_task *self, rt_job *job) {
     open_job(self, job, rt_task_next_release_ns(self));
 }
 
-/* ---- a job runs ----------------------------------------------------------------------------------------------------- */
+/* ---- a job runs ------------------------------------------------------------------------------------------------ */
 
 bool rt_task_expired(const rt_task *self, rt_job *job) {
     const int64_t budget_ns = self->config.reaction.budget_ns;
@@ -155,7 +156,8 @@ void rt_task_stepped(rt_task *self, rt_job *job) {
 }
 
 bool rt_task_late_now(const rt_task *self, const rt_job *job) {
-    return !self->config.virtual_time && self->clock.now_ns(self->clock.ctx) - job->origin_ns > self->config.deadline_ns;
+    return !self->config.virtual_time &&
+           self->clock.now_ns(self->clock.ctx) - job->origin_ns > self->config.deadline_ns;
 }
 
 static void record(rt_task *self, const rt_job *job, rt_metric metric, int64_t value_ns) {
@@ -214,7 +216,9 @@ static rt_delay delay_until(const rt_task *self, const rt_job *job, int64_t end_
 static rt_cause cause_of(rt_task *self, rt_job *job, bool sent, bool stale_input) {
     if (job->miss_late) {
         const rt_delay delay = delay_until(self, job, job->published_ns);
-        job->stolen_ns = self->canary_conclusive ? rt_theft_between(&self->theft, job->release_ns, job->published_ns) : 0;
+        if (self->canary_conclusive) {
+            job->stolen_ns = rt_theft_between(&self->theft, job->release_ns, job->published_ns);
+        }
         return rt_cause_late(&delay, job->resp_ns, self->config.deadline_ns, job->stolen_ns);
     }
     return !sent ? RT_CAUSE_BLOCKED_SEND : stale_input ? RT_CAUSE_STALE_INPUT : RT_CAUSE_NONE;
@@ -236,7 +240,7 @@ void rt_task_published(rt_task *self, rt_job *job, bool sent, bool stale_input) 
     rt_seqlock_end(&self->version);
 }
 
-/* ---- a job ends ----------------------------------------------------------------------------------------------------- */
+/* ---- a job ends ------------------------------------------------------------------------------------------------ */
 
 static void skip_counted(rt_task *self, uint64_t first, uint64_t count) {
     const uint64_t early = in_warmup(self, first, count);
@@ -320,7 +324,7 @@ void rt_task_done(rt_task *self, rt_job *job) {
     rt_seqlock_end(&self->version);
 }
 
-/* ---- tasks on events ------------------------------------------------------------------------------------------------ */
+/* ---- tasks on events ------------------------------------------------------------------------------------------- */
 
 static bool hit_while_running(const rt_task *self, int64_t at_ns) {
     return self->last_index != 0 && at_ns >= self->last_start_ns && at_ns < self->last_done_ns;
@@ -362,7 +366,7 @@ void rt_task_event_passed(rt_task *self, int64_t at_ns) {
     rt_seqlock_end(&self->version);
 }
 
-/* ---- another thread ------------------------------------------------------------------------------------------------- */
+/* ---- another thread -------------------------------------------------------------------------------------------- */
 
 _Static_assert(sizeof(rt_tally) % 8 == 0 && sizeof(rt_stats) % 8 == 0, "copied by words");
 

@@ -1,9 +1,10 @@
 /* A periodic task on an absolute release grid: when to run, what each job took, what was missed and why.
  *
- * Releases are r_n = t0 + n·T for n = 1, 2, …; the grid never moves (but see rebase). Every latency counts from the intended
- * release r_n, never from the actual start. The order of calls in one period is
+ * Releases are r_n = t0 + n·T for n = 1, 2, …; the grid never moves (but see rebase). Every latency counts from the
+ * intended release r_n, never from the actual start. The order of calls in one period is
  *
- *     rt_task_wait       sleeps to the next release   (rt_task_release: virtual time, no sleep; rt_task_event: a frame came)
+ *     rt_task_wait       sleeps to the next release   (rt_task_release: virtual time, no sleep; rt_task_event: a
+ *                        frame came)
  *         … read inputs, step; between iterations rt_task_expired …
  *     rt_task_stepped
  *         … rt_task_late_now: is this output late already? publish it …
@@ -11,9 +12,11 @@
  *         … publish the timing, housekeeping …
  *     rt_task_done       activations hit meanwhile are accounted for
  *
- * An activation passes when the job is done after it (r < done_ns). `overrun` counts those with start_ns <= r < done_ns (3.1 ms
- * of work at T = 1 ms: 3); those that passed before a late wake are no overrun. What becomes of them:
- *   skip     all are skipped and counted; the next job runs at the first r >= done_ns: whole periods are lost, the phase is kept
+ * An activation passes when the job is done after it (r < done_ns). `overrun` counts those with start_ns <= r <
+ * done_ns (3.1 ms of work at T = 1 ms: 3); those that passed before a late wake are no overrun. What becomes of
+ * them:
+ *   skip     all are skipped and counted; the next job runs at the first r >= done_ns: whole periods are lost, the
+ *            phase is kept
  *   queue:N  the oldest wait and run late, one after another, flagged `queued`; those that find N waiting are skipped
  *   rebase   none is lost: the grid moves, so that the next release is done_ns; counted, the total is phase_ns
  * Beside them: `cut`, a budget from the release on that the solver asks for, and `stop`, after so many judged misses.
@@ -51,8 +54,8 @@ typedef struct {
     int64_t deadline_ns;       /* 0 < D <= T */
     int64_t t0_ns;             /* r_0, before the first release */
     uint64_t warmup_releases;  /* releases 1..this are shown but not judged */
-    bool virtual_time;         /* lock-step: the caller names the release, there is no wake latency, nothing is late or skipped */
-    bool on_event;             /* releases are events (rt_task_event), not a grid; T is their nominal distance; skip only */
+    bool virtual_time;         /* lock-step: the caller names the release; no wake latency, none late or skipped */
+    bool on_event;             /* releases are events (rt_task_event), T: their nominal distance; skip only */
     rt_reaction reaction;
     uint32_t mk_m;             /* (m, K) of the judged releases, m < K <= RT_MK_WINDOW; K = 0: no monitor */
     uint32_t mk_k;
@@ -93,7 +96,7 @@ typedef enum {
     RT_METRIC_PERIOD_DEV_ABS,  /* |period_dev|, for its quantiles */
     RT_METRIC_PERIOD_DEV,      /* (start_k - start_{k-1}) - (n_k - n_{k-1})·T; about half of it is underflow */
     RT_METRIC_SLACK,           /* D - resp: underflow counts the late jobs */
-    RT_METRIC_CANARY,          /* the canary's wake latency; its index is the job that read it, the first published afterwards */
+    RT_METRIC_CANARY,          /* the canary's wake latency; index: the job that read it, the first published then */
     RT_METRICS
 } rt_metric;
 
@@ -134,31 +137,33 @@ typedef struct {
 } rt_task;
 
 /* Copies `config` and `clock`. RT_TASK_BAD_CONFIG (self untouched) for T <= 0, D outside (0, T], a reaction that
- * rt_reaction_valid refuses, events with another overrun policy than skip, m >= K, K > RT_MK_WINDOW or a missing clock. */
+ * rt_reaction_valid refuses, events with another overrun policy than skip, m >= K, K > RT_MK_WINDOW or a missing
+ * clock. */
 rt_task_status rt_task_init(rt_task *self, const rt_task_config *config, const rt_clock *clock);
 
-/* Puts r_0 at `t0_ns` before the first job has run; afterwards the grid never moves and RT_TASK_BAD_CONFIG is returned. */
+/* Puts r_0 at `t0_ns` before the first job has run; afterwards the grid never moves and RT_TASK_BAD_CONFIG is
+ * returned. */
 rt_task_status rt_task_start_grid(rt_task *self, int64_t t0_ns);
 
-/* Takes the canary's records from `ring` with every job. `conclusive`: its lateness is the machine's, so that a miss can be blamed
- * on steal. Before the first job; the ring must outlive `self`. */
+/* Takes the canary's records from `ring` with every job. `conclusive`: its lateness is the machine's, so that a miss
+ * can be blamed on steal. Before the first job; the ring must outlive `self`. */
 void rt_task_set_canary(rt_task *self, rt_canary_ring *ring, bool conclusive);
 
-/* Sleeps to the next release and opens its job; a release that waits in the queue is opened at once. RT_TASK_INTERRUPTED
- * when a signal came first: nothing has changed, call again or stop. RT_TASK_STOPPED: no job, now and ever after.
- * Blocks up to one period. Not for tasks on events. */
+/* Sleeps to the next release and opens its job; a release that waits in the queue is opened at once.
+ * RT_TASK_INTERRUPTED when a signal came first: nothing has changed, call again or stop. RT_TASK_STOPPED: no job,
+ * now and ever after. Blocks up to one period. Not for tasks on events. */
 rt_task_status rt_task_wait(rt_task *self, rt_job *job);
 
 /* Virtual time only: opens the next job, whose release is t0 + n·T, without sleeping. O(1). */
 void rt_task_release(rt_task *self, rt_job *job);
 
-/* Tasks on events: opens the job of the event at `release_ns` (a kernel stamp, say, on the task's clock; now at the latest).
- * Flagged `queued` and counted as overrun when it came while the job before still ran. RT_TASK_STOPPED as rt_task_wait.
- * O(1). */
+/* Tasks on events: opens the job of the event at `release_ns` (a kernel stamp, say, on the task's clock; now at the
+ * latest). Flagged `queued` and counted as overrun when it came while the job before still ran. RT_TASK_STOPPED as
+ * rt_task_wait. O(1). */
 rt_task_status rt_task_event(rt_task *self, rt_job *job, int64_t release_ns);
 
-/* Tasks on events: an event at `at_ns` gets no job of its own (a later one stands for it): it is skipped and counted. Between
- * rt_task_done and the next rt_task_event, in order of time. O(1). */
+/* Tasks on events: an event at `at_ns` gets no job of its own (a later one stands for it): it is skipped and
+ * counted. Between rt_task_done and the next rt_task_event, in order of time. O(1). */
 void rt_task_event_passed(rt_task *self, int64_t at_ns);
 
 /* When the next job is due; in the past for one that waits in the queue. Not for tasks on events. O(1). */
@@ -174,8 +179,8 @@ bool rt_task_expired(const rt_task *self, rt_job *job);
 /* The step is over. O(1), two clock reads. */
 void rt_task_stepped(rt_task *self, rt_job *job);
 
-/* True when an output published now would be late (now - r > D). After rt_task_stepped, to decide what is published. Never
- * true in virtual time. O(1), one clock read. */
+/* True when an output published now would be late (now - r > D). After rt_task_stepped, to decide what is published.
+ * Never true in virtual time. O(1), one clock read. */
 bool rt_task_late_now(const rt_task *self, const rt_job *job);
 
 /* The output has been handed to the bus (`sent`: it was accepted). Fills resp, miss and cause (rules in rt_cause.h) and
@@ -200,8 +205,9 @@ typedef struct {
     uint64_t migrations;
 } rt_task_counters;
 
-/* A consistent copy of the counters and, where `stats` is not NULL, of one metric (`warmup`: of that window). Any thread, without
- * making the task wait; false when it was busy at all of `tries` attempts, and the outputs are then of no use. About 2 µs a try. */
+/* A consistent copy of the counters and, where `stats` is not NULL, of one metric (`warmup`: of that window). Any
+ * thread, without making the task wait; false when it was busy at all of `tries` attempts, and the outputs are then
+ * of no use. About 2 µs a try. */
 bool rt_task_snapshot(const rt_task *self, rt_metric metric, bool warmup, unsigned tries, rt_task_counters *counters,
                       rt_stats *stats);
 

@@ -23,11 +23,12 @@ typedef struct {
 /* Empties it. */
 void rt_theft_init(rt_theft *self);
 
-/* The canary was due at `due_ns` and woke at `woke_ns`, or has not run until then. In order of time; what an earlier call covers counts
- * once. O(1). */
+/* The canary was due at `due_ns` and woke at `woke_ns`, or has not run until then. In order of time; what an earlier
+ * call covers counts once. O(1). */
 void rt_theft_note(rt_theft *self, int64_t due_ns, int64_t woke_ns);
 
-/* Time taken between `from_ns` and `to_ns`. A lower bound: the canary cannot tell what was taken before it was due. O(RT_THEFTS). */
+/* Time taken between `from_ns` and `to_ns`. A lower bound: the canary cannot tell what was taken before it was due.
+ * O(RT_THEFTS). */
 int64_t rt_theft_between(const rt_theft *self, int64_t from_ns, int64_t to_ns);
 
 #endif

@@ -1,5 +1,5 @@
-/* The estimator's whole cycle in virtual time: the machine of rt_world_shim.c, and a bus whose frames arrive when a script says.
- * Compiled by test_est_virtual_time.py against the built library. */
+/* The estimator's whole cycle in virtual time: the machine of rt_world_shim.c, and a bus whose frames arrive when a
+ * script says. Compiled by test_est_virtual_time.py against the built library. */
 #include "rt_world_shim.c"
 
 #include "est_cycle.h"
@@ -120,9 +120,9 @@ int est_world_open(const rt_task_config *config) {
 }
 
 /* Runs up to `n` jobs and sends the final counters. Returns how many ran, or -1 for a configuration it refused. */
-int64_t est_world_run(const rt_task_config *config, const machine *m, const theft *thefts, size_t theft_count, const step *steps,
-                      size_t n, const arrival *arrivals, size_t arrival_count, outcome *out, departure *sent,
-                      size_t *sent_count, rt_canary_record *heard, size_t *heard_count) {
+int64_t est_world_run(const rt_task_config *config, const machine *m, const theft *thefts, size_t theft_count,
+                      const step *steps, size_t n, const arrival *arrivals, size_t arrival_count, outcome *out,
+                      departure *sent, size_t *sent_count, rt_canary_record *heard, size_t *heard_count) {
     world *w = calloc(1, sizeof *w);
     const rt_clock clock = {w, world_now, world_cpu, world_sleep, world_core};
     bus b = {.world = w, .next = arrivals, .end = arrivals + arrival_count, .sent = sent, .sent_room = *sent_count};

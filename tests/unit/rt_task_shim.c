@@ -46,7 +46,8 @@ static bool world_sleep(void *ctx, int64_t at_ns) {
 }
 
 static counters view(const rt_tally *t) {
-    const counters c = {t->releases, t->jobs, t->miss_late, t->miss_skipped, t->overrun, t->consec_miss_max, t->mk_worst};
+    const counters c = {t->releases, t->jobs,            t->miss_late, t->miss_skipped,
+                        t->overrun,  t->consec_miss_max, t->mk_worst};
     return c;
 }
 
@@ -88,8 +89,8 @@ int shim_run(const rt_task_config *config, int64_t now_ns, const script *steps, 
         w.now_ns += steps[i].rest_ns;
         rt_task_done(task, &job);
         bad |= broken(task);
-        const outcome o = {(int64_t)job.index, job.release_ns, job.start_ns, job.published_ns, job.done_ns, job.wake_lat_ns,
-                           job.resp_ns, job.after_skip, job.miss_late, job.cause, job.warmup};
+        const outcome o = {(int64_t)job.index, job.release_ns, job.start_ns, job.published_ns, job.done_ns,
+                           job.wake_lat_ns, job.resp_ns, job.after_skip, job.miss_late, job.cause, job.warmup};
         jobs[i] = o;
         bad = bad != 0 ? (int)i + 1 : 0;
     }

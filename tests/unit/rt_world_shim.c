@@ -1,6 +1,6 @@
-/* A machine in virtual time around rt_task: it wakes late, preempts, computes in iterations, steals the core, blocks a send; a
- * canary wakes beside the job. Everything the clock said is handed back, so that a model can say what should have come of it.
- * Compiled by tests (rt_shim.py), not by the build. */
+/* A machine in virtual time around rt_task: it wakes late, preempts, computes in iterations, steals the core, blocks
+ * a send; a canary wakes beside the job. Everything the clock said is handed back, so that a model can say what
+ * should have come of it. Compiled by tests (rt_shim.py), not by the build. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -34,7 +34,8 @@ typedef struct {
 } machine;
 
 typedef struct {
-    int64_t slept_until_ns, index, release_ns, start_ns, start_cpu_ns, stepped_ns, stepped_cpu_ns, published_ns, done_ns;
+    int64_t slept_until_ns, index, release_ns, start_ns, start_cpu_ns;
+    int64_t stepped_ns, stepped_cpu_ns, published_ns, done_ns;
     int64_t asked, asked_ns, expired, late_now;
     int64_t wake_lat_ns, exec_wall_ns, exec_cpu_ns, preempt_ns, resp_ns, stolen_ns, canary_ns;
     int64_t warmup, after_skip, queued, cut, miss_late, cause;
@@ -168,8 +169,8 @@ static void fill(outcome *o, const rt_task *task, const rt_job *job, const world
     o->slept_until_ns = w->slept_until_ns;
     o->index = (int64_t)job->index;
     o->release_ns = job->release_ns;
-    o->broken |= o->start_ns != job->start_ns || o->start_cpu_ns != job->start_cpu_ns || o->stepped_ns != job->stepped_ns ||
-                 o->published_ns != job->published_ns || o->done_ns != job->done_ns;
+    o->broken |= o->start_ns != job->start_ns || o->start_cpu_ns != job->start_cpu_ns ||
+                 o->stepped_ns != job->stepped_ns || o->published_ns != job->published_ns || o->done_ns != job->done_ns;
     o->wake_lat_ns = job->wake_lat_ns;
     o->exec_wall_ns = job->exec_wall_ns;
     o->exec_cpu_ns = job->exec_cpu_ns;
@@ -192,8 +193,9 @@ static void fill(outcome *o, const rt_task *task, const rt_job *job, const world
 }
 
 /* Runs up to `n` jobs. Returns how many ran (fewer: the task stopped itself), or -1 for a configuration it refused. */
-int64_t world_run(rt_task *task, const rt_task_config *config, const machine *m, const theft *thefts, size_t theft_count,
-                  const step *steps, size_t n, outcome *out, rt_canary_record *heard, size_t *heard_count) {
+int64_t world_run(rt_task *task, const rt_task_config *config, const machine *m, const theft *thefts,
+                  size_t theft_count, const step *steps, size_t n, outcome *out,
+                  rt_canary_record *heard, size_t *heard_count) {
     world *w = calloc(1, sizeof *w);
     const rt_clock clock = {w, world_now, world_cpu, world_sleep, world_core};
     w->machine = m;
@@ -240,8 +242,8 @@ static void tally(const rt_tally *t, uint64_t out[11]) {
     memcpy(out, values, sizeof values);
 }
 
-void world_counters(const rt_task *task, uint64_t total[11], uint64_t warmup[11], uint64_t judged[11], uint64_t causes[3][RT_CAUSES],
-                    uint64_t other[4]) {
+void world_counters(const rt_task *task, uint64_t total[11], uint64_t warmup[11], uint64_t judged[11],
+                    uint64_t causes[3][RT_CAUSES], uint64_t other[4]) {
     tally(&task->total, total);
     tally(&task->warmup, warmup);
     tally(&task->judged, judged);
@@ -253,7 +255,8 @@ void world_counters(const rt_task *task, uint64_t total[11], uint64_t warmup[11]
 }
 
 /* The histogram of a metric: summary and the buckets that are not empty, three numbers each; returns how many. */
-size_t world_histogram(const rt_task *task, size_t metric, int warmup, rt_summary *summary, int64_t (*rows)[3], size_t room) {
+size_t world_histogram(const rt_task *task, size_t metric, int warmup, rt_summary *summary, int64_t (*rows)[3],
+                       size_t room) {
     const rt_stats *stats = warmup ? &task->warmup_stats[metric] : &task->stats[metric];
     size_t used = 0;
     rt_stats_summary(stats, summary);
