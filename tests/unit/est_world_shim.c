@@ -108,7 +108,7 @@ int est_world_open(const rt_task_config *config) {
     static const est_identity identity;
     const size_t size = (sizeof(est_cycle) + 63) / 64 * 64;
     const rt_clock clock = {NULL, world_now, world_cpu, world_sleep, world_core};
-    const est_io io = {NULL, bus_begin, bus_recv, bus_send, bus_counters};
+    const est_io io = {NULL, bus_begin, bus_recv, bus_send, bus_counters, NULL};
     cycle = aligned_alloc(64, size);
     fresh = aligned_alloc(64, size);
     if (cycle == NULL || fresh == NULL ||
@@ -120,7 +120,7 @@ int est_world_open(const rt_task_config *config) {
 }
 
 /* Runs up to `n` jobs and sends the final counters. Returns how many ran, or -1 for a configuration it refused. */
-int64_t est_world_run(const rt_task_config *config, const machine *m, const theft *thefts, size_t theft_count,
+int64_t est_world_run(const rt_task_config *config, est_on_miss on_miss, const machine *m, const theft *thefts, size_t theft_count,
                       const step *steps, size_t n, const arrival *arrivals, size_t arrival_count, outcome *out,
                       departure *sent, size_t *sent_count, rt_canary_record *heard, size_t *heard_count) {
     world *w = calloc(1, sizeof *w);
@@ -136,6 +136,7 @@ int64_t est_world_run(const rt_task_config *config, const machine *m, const thef
     w->heard_room = *heard_count;
     memcpy(cycle, fresh, sizeof *cycle);
     cycle->io.ctx = &b;
+    est_cycle_on_miss(cycle, on_miss);
     int64_t ran = -1;
     if (rt_task_init(&cycle->task, config, &clock) == RT_TASK_OK) {
         if (m->canary != 0) {

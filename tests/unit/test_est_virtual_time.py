@@ -28,6 +28,8 @@ from tests.unit.test_rt_virtual_time import MS, TRACE, US, config_of, machine, q
 
 PERIOD = 10 * MS
 ROOM = 8192
+ON_MISS = ("late", "hold", "predict", "invalid")
+COMPUTED, HELD, PREDICTED, INVALID = range(4)  # EstTimingC.output
 
 
 class Arrival(ct.Structure):
@@ -58,7 +60,7 @@ class EstWorld:
         self.dbc = load_dbc()
         assert self.c.est_world_open(ct.byref(config_of(tm.Setting(PERIOD, PERIOD)))) == 0
 
-    def run(self, setting: tm.Setting, how: dict, steps: list[dict], thefts: list, arrivals: list):
+    def run(self, setting: tm.Setting, on_miss: str, how: dict, steps: list[dict], thefts: list, arrivals: list):
         """(jobs, canary's wake-ups, decoded frames by job; those of the final counters under -1)."""
         n, fields = len(steps), rt_shim.JOB_FIELDS
         flat = [step[name] for step in steps for name in rt_shim.STEP_FIELDS]
@@ -66,6 +68,7 @@ class EstWorld:
         sent, count, heard_count = (Departure * ROOM)(), ct.c_size_t(ROOM), ct.c_size_t(rt_shim.HEARD)
         ran = self.c.est_world_run(
             ct.byref(config_of(setting)),
+            ON_MISS.index(on_miss),
             (I64 * len(rt_shim.MACHINE_FIELDS))(*(machine(setting, **how)[name] for name in rt_shim.MACHINE_FIELDS)),
             (I64 * max(1, 2 * len(thefts)))(*(at for span in thefts for at in span)),
             ct.c_size_t(len(thefts)),
@@ -142,7 +145,8 @@ class Reception:
     max_delta: int
     timeout_ns: int
     counter: int | None = None
-    last_ns: int | None = None
+    last_ns: int | None = None  # of the newest frame with news
+    used_ns: int | None = None  # of the newest one that is intact and no repetition
     last_tick: int | None = None
     verdicts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
 
@@ -156,9 +160,13 @@ class Reception:
             self.verdicts["sequence"] += 1
         if delta == 0:
             return
+        self.used_ns = at_ns
         tick = int.from_bytes(data[6:8], "little")
         if tick != self.last_tick:
             self.last_tick, self.last_ns = tick, at_ns
+
+    def age_us(self, now_ns: int) -> Any:
+        return None if self.used_ns is None else tenths(now_ns - self.used_ns)
 
     def stale(self, now_ns: int) -> bool:
         return self.last_ns is not None and now_ns - self.last_ns > self.timeout_ns
@@ -175,10 +183,22 @@ def tenths(ns: int) -> Any:
     return pytest.approx(ns / US, abs=0.051)
 
 
-def check(world, setting: tm.Setting, steps: list[dict], thefts: list, arriving: list, **how: int) -> tm.Model:
+def stand_ins(on_miss: str, late: bool, in_time_before: bool) -> tuple[int, ...]:
+    """What a job may put out; whether a prediction has anything to start from is the estimator's business."""
+    if not late or on_miss == "late":
+        return (COMPUTED,)
+    held = (HELD,) if in_time_before else (INVALID,)
+    return {"hold": held, "predict": (PREDICTED, INVALID), "invalid": (INVALID,)}[on_miss]
+
+
+def check(
+    world, setting: tm.Setting, steps: list[dict], thefts: list, arriving: list, on_miss: str = "late", **how: int
+) -> tm.Model:
     """Runs the cycle and the models and compares every timing frame and the final counters. Returns the model."""
     arrivals = [Arrival(at_ns, can_id, len(d), (ct.c_uint8 * 8)(*d)) for at_ns, can_id, d, _ in arriving]
-    jobs, heard, frames = world.run(setting, how, steps, thefts, arrivals)
+    jobs, heard, frames = world.run(setting, on_miss, how, steps, thefts, arrivals)
+    motor, temp = (world.dbc[name].frame_id for name in ("MotorState", "TempMeas"))
+    outputs: list[int] = []
     model, known, read, stale_jobs, rx = tm.Model(setting), 0, 0, 0, receptions(world)
     for number, (job, step) in enumerate(zip(jobs, steps, strict=False)):
         assert job["broken"] == 0
@@ -191,14 +211,21 @@ def check(world, setting: tm.Setting, steps: list[dict], thefts: list, arriving:
         upto = known
         while upto < len(heard) and heard[upto][1] <= job["published_ns"]:
             upto += 1
+        a, b, c, d = (frames[number][f"EstTiming{letter}"] for letter in "ABCD")
+        job["asked"], job["asked_ns"] = c["cut"], job["stepped_ns"]  # how often the solver asks is its own business
         stimulus = {name: step[name] if name in ("sent", "stale") else job[name] for name in TRACE}
         due_ns = heard[upto][0] if upto < len(heard) else None
         want = model.run(tm.Trace(**stimulus | {"stale": stale}), heard[known:upto], due_ns)
         known = upto
-        a, b, d = (frames[number][f"EstTiming{letter}"] for letter in "ABD")
         assert a["release_index"] == want.index
         assert (a["miss_late"], a["warmup"], a["after_skip"]) == (want.miss_late, want.warmup, want.after_skip)
         assert a["stale_input"] == stale
+        assert (c["queued"], c["cut"]) == (want.queued, want.cut)
+        assert c["output"] in stand_ins(on_miss, want.late_now, COMPUTED in outputs)
+        outputs.append(int(c["output"]))
+        assert c["in_age_motor_us"] == rx[motor].age_us(job["start_ns"])
+        assert c["in_age_temp_us"] == rx[temp].age_us(job["start_ns"])
+        assert d["canary_us"] == (None if want.canary_ns < 0 else tenths(want.canary_ns))
         assert b["miss_cause"] == tm.CAUSES.index(want.cause)
         times = (a["wake_lat_us"], b["exec_wall_us"], b["resp_us"], d["exec_cpu_us"])
         assert times == (*map(tenths, (want.wake_lat_ns, want.exec_wall_ns, want.resp_ns, want.exec_cpu_ns)),)
@@ -209,6 +236,16 @@ def check(world, setting: tm.Setting, steps: list[dict], thefts: list, arriving:
     assert {name: last["EstMisses"][name] for name in misses} == misses
     assert last["EstMissRun"]["consec_miss_max"] == total["consec_miss_max"]
     assert last["EstMissRun"]["mk_worst"] == total["mk_worst"]
+    assert last["EstMissRun"]["phase_us"] == model.phase_ns // US
+    overload = {
+        "waiting": total["queued_now"],
+        "queued": total["queued"],
+        "cut": sum(job.cut for job in model.jobs),
+        "rebased": model.rebased,
+    }
+    assert {name: last["EstOverload"][name] for name in overload} == overload
+    put_out = {"held": HELD, "predicted": PREDICTED, "invalidated": INVALID}
+    assert {name: last["EstOutputs"][name] for name in put_out} == {n: outputs.count(o) for n, o in put_out.items()}
     assert last["EstInputFaults"]["crc_errors"] == sum(message.verdicts["crc"] for message in rx.values())
     assert last["EstInputFaults"]["seq_errors"] == sum(message.verdicts["sequence"] for message in rx.values())
     assert last["EstInputFaults"]["stale_inputs"] == stale_jobs
@@ -226,7 +263,7 @@ def counted(world, stream, faults: list[tuple[int, str, int]]) -> dict[str, int]
     arriving = disturbed(stream, faults)
     check(world, SETTING, STEPS, [], arriving)
     _, _, frames = world.run(
-        SETTING, {}, STEPS, [], [Arrival(t, i, len(d), (ct.c_uint8 * 8)(*d)) for t, i, d, _ in arriving]
+        SETTING, "late", {}, STEPS, [], [Arrival(t, i, len(d), (ct.c_uint8 * 8)(*d)) for t, i, d, _ in arriving]
     )
     return {name: int(value) for name, value in frames[-1]["EstInputFaults"].items() if name.endswith(("rs", "ts"))}
 
@@ -263,17 +300,32 @@ est_settings = st.builds(
     period_ns=st.just(PERIOD),
     deadline_ns=st.sampled_from([PERIOD, PERIOD // 2]),
     warmup=st.integers(0, 10),
-    policy=st.sampled_from([tm.Policy(), tm.Policy("rebase"), tm.Policy("queue", 2), tm.Policy("stop", stop_total=4)]),
+    policy=st.sampled_from(
+        [
+            tm.Policy(),
+            tm.Policy("rebase"),
+            tm.Policy("queue", 2),
+            tm.Policy("stop", stop_total=4),
+            tm.Policy("cut", budget_ns=MS),
+        ]
+    ),
     canary=st.integers(0, 2),
 )
 
 
 @settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(est_settings, st.integers(5, 40), troubles, bus_faults, st.lists(st.integers(0, 40), max_size=2))
-def test_any_bus_and_any_machine(world, stream, setting, count, things, faults, stolen):
+@given(
+    est_settings,
+    st.sampled_from(ON_MISS),
+    st.integers(5, 40),
+    troubles,
+    bus_faults,
+    st.lists(st.integers(0, 40), max_size=2),
+)
+def test_any_bus_and_any_machine(world, stream, setting, on_miss, count, things, faults, stolen):
     steps = [dict(step) for step in STEPS[:count]]
     for at, kind, value in things:
         step = steps[at % count]
         step[kind] = step[kind] + value if kind.endswith("_ns") else 1 - step[kind]
     thefts = [(n * PERIOD - MS, n * PERIOD + 9 * MS) for n in sorted(set(stolen))]
-    check(world, setting, steps, thefts, disturbed(stream, faults), canary_lat_ns=30 * US)
+    check(world, setting, steps, thefts, disturbed(stream, faults), on_miss, canary_lat_ns=30 * US)
