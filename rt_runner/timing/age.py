@@ -37,7 +37,8 @@ WANTED = {
 class Age:
     """One element per job; integer ns, `NO_NS` where not available.
 
-    ``parts`` of jobs that put out what they computed. ``sensor`` is TempMeas' stamp to Estimate's stamp, of the first
+    Jobs that use the plant's last sample once more have none, the plant had ended. ``parts`` of jobs that put out what
+    they computed. ``sensor`` is TempMeas' stamp to Estimate's stamp, of the first
     job that used each TempMeas.
     """
 
@@ -71,15 +72,16 @@ def age_of(log: LogColumns, jobs: Jobs) -> Age:
     wait, temp_age = times.get("in_age_motor"), times.get("in_age_temp")
     compute, publish = times["exec_wall"], times["publish"]
     ticks, status = estimate.signal("tick"), estimate.signal("status")
-    near, last_sensor = min(motor), -1
+    near, last_sensor, last_tick, ended = min(motor), -1, max(motor), False
     for k in range(count):
         i = places[k]
         if i < 0 or ticks[i] != ticks[i] or status[i] == 0:
             continue  # its frame is missing, or it has heard nothing yet and its tick means nothing
         tick = _nearest(near, int(ticks[i]))
         received_ns = motor.get(tick)
-        if received_ns is None:
-            continue
+        if received_ns is None or (ended and tick == last_tick):
+            continue  # the plant has sent its last sample: from its second use on nothing newer can have come
+        ended = tick == last_tick
         near, stamp_ns = tick, estimate.t_ns[i]
         sampled = samples.get(tick)
         if sampled is not None:

@@ -161,6 +161,7 @@ def _cycle_rows(cycles: Sequence[CycleRow]) -> Rows:
             continue
         times = (ms(v) for v in (r.mean_ms, r.min_ms, r.max_ms, r.std_ms))
         says = "silent" if r.timeouts else "wrong rate" if cycle_ok(r) is False else "ok"
+        says = says if r.frames else "never came"
         counts = (str(n or "·") for n in (r.missing, r.timeouts))
         rows.append((r.name, f"{r.frame_id:03X}", str(r.frames), f"{r.cycle_ms:g}", *times, *counts, says))
     return rows

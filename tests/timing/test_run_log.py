@@ -12,6 +12,10 @@ import pytest
 from rt_runner.dbc import load_dbc
 from rt_runner.mcap_log import read_log
 from rt_runner.result import Unwrapper
+from rt_runner.timing.age import PARTS
+from rt_runner.timing.analyse import analyse
+from rt_runner.timing.jobs import NO_NS
+from tests.support import timing_logs
 from tests.support.buses import have_vcan
 from tests.support.runs import load_result, rt_runner
 from tests.timing.estimator_process import PER_JOB
@@ -35,7 +39,7 @@ def run(request, tmp_path_factory):
     for t_ns, name, values, e2e in read_log(log):
         frames[name].append((t_ns, values, e2e))
         order.append((t_ns, name, values))
-    return SimpleNamespace(bus=request.param, frames=frames, order=order, result=load_result(out), text=done.stderr)
+    return SimpleNamespace(bus=request.param, log=log, frames=frames, order=order, result=load_result(out), text=done.stderr)
 
 
 def test_it_says_which_bus_it_took_and_why(run):
@@ -65,6 +69,41 @@ def test_every_release_is_accounted_for(run):
     assert final_misses["miss_skipped"] == skipped
     timing = run.result["timing"]["estimator"]
     assert (timing["jobs"], timing["miss_skipped"]) == (len(indices), skipped)
+
+
+def test_the_books_balance(run):
+    """Counters, flags, histograms and frames of the real processes agree, on either bus."""
+    timing = analyse(run.log).processes[0]
+    assert timing.audit.ok, timing.audit.failed
+    made = {c.name for c in timing.audit.checks if c.ok}
+    assert made >= {"file", "frames", "releases", "executed", "skipped", "counts", "clusters", "monotonic"}
+    assert len(timing.jobs) == len(run.frames["Estimate"])
+
+
+def test_one_frame_less_and_they_do_not(run, tmp_path):
+    number = next(i for i, (_, name, _) in enumerate(run.order) if name == "EstTimingC" and i > len(run.order) / 2)
+    cut = timing_logs.copy_without(run.log, tmp_path / "cut.mcap", lambda i, _: i == number)
+    report = analyse(cut)
+    assert not report.processes[0].audit.ok
+    assert report.verdict == "fail"
+    assert [(m.message, m.count) for m in report.processes[0].audit.missing] == [("EstTimingC", 1)]
+
+
+def test_estimates_are_as_old_as_their_sample(run):
+    """From the plant's sample to the bus; the parts are those of three clocks and still add up to little rest."""
+    ages = analyse(run.log).processes[0].ages
+    known = [k for k, v in enumerate(ages["e2e_rest"]) if v != NO_NS]
+    assert len(known) > 0.7 * len(run.frames["Estimate"])
+    for k in known:
+        parts = {p: ages[f"e2e_{p}"][k] for p in PARTS}
+        assert sum(parts.values()) == ages["e2e"][k]
+        assert min(parts[p] for p in ("send", "wait", "compute", "publish")) >= 0
+    rest = sorted(abs(ages["e2e_rest"][k]) for k in known)
+    e2e = sorted(ages["e2e"][k] for k in known)
+    assert e2e[0] > 0
+    # A sample is at most one tick old when the job starts, if plant and bus get their processor at all: in the middle.
+    assert e2e[len(e2e) // 2] < 25_000_000
+    assert rest[len(rest) // 2] < 5_000_000
 
 
 def test_skipped_releases_are_announced_by_the_next_job(run):

@@ -165,6 +165,19 @@ def test_a_held_output_has_an_age_but_no_parts(folder):
     assert ages["e2e_wait"][48] != NO_NS
 
 
+def test_jobs_after_the_plants_last_sample_are_not_older_every_time(folder):
+    """The plant ends, the estimator runs on: the first job with the last sample counts, the others tell nothing."""
+    script = logs.regular(60)
+    frames = [f for f in logs.job_frames(script[:40]) if f[1] in ("MotorState", "PlantSample", "TempMeas")]
+    last = max(f[0] for f in frames if f[1] == "MotorState")
+    own = [f for f in logs.job_frames(script) if logs.dbc()[f[1]].sender == "ESTIMATOR"]
+    tick = max(f[2]["tick"] for f in frames if f[1] == "MotorState" and f[0] == last)
+    own = [(t, n, {**v, "tick": tick} if n == "Estimate" and t > last else v) for t, n, v in own]
+    log = logs.write(folder / "end.mcap", sorted(frames + own, key=lambda f: f[0]), facts={})
+    ages = analyse(log).processes[0].ages["e2e"]
+    assert [k for k, v in enumerate(ages) if v == NO_NS] == list(range(41, 60))
+
+
 def test_a_late_estimate_is_as_old_as_it_is(folder):
     """The plant's tick, not the nearest stamp, says which sample was used: a job that took 47 ms used an old one."""
     script = [replace(j, wall_ns=47_000_000, cause="long_compute") if j.release == 30 else j for j in logs.regular(30)]
