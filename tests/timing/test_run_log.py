@@ -39,7 +39,9 @@ def run(request, tmp_path_factory):
     for t_ns, name, values, e2e in read_log(log):
         frames[name].append((t_ns, values, e2e))
         order.append((t_ns, name, values))
-    return SimpleNamespace(bus=request.param, log=log, frames=frames, order=order, result=load_result(out), text=done.stderr)
+    return SimpleNamespace(
+        bus=request.param, log=log, frames=frames, order=order, result=load_result(out), text=done.stderr
+    )
 
 
 def test_it_says_which_bus_it_took_and_why(run):
