@@ -25,6 +25,7 @@ _SIOCGIFFLAGS, _SIOCGIFHWADDR = 0x8913, 0x8927
 _IFF_UP, _ARPHRD_CAN, _IFNAMSIZ = 0x1, 280, 16
 _SOCKET_PATH_MAX = 107
 _HUB_READY_S = 5.0
+HUB_PRIORITY = 40  # SCHED_FIFO: below the loops it serves, above whatever else its core does
 
 
 @dataclass(frozen=True)
@@ -169,6 +170,8 @@ class HubProcess:
     ----------
     stall_s : float
         How long a client may leave the bus waiting before the hub disconnects it.
+    priority : int, optional
+        SCHED_FIFO priority to ask for; ``refused`` says why the system did not grant it.
 
     Raises
     ------
@@ -176,9 +179,10 @@ class HubProcess:
         The binary is missing or did not start; nothing is left behind.
     """
 
-    def __init__(self, stall_s: float = 2.0, cores: set[int] | None = None) -> None:
+    def __init__(self, stall_s: float = 2.0, cores: set[int] | None = None, priority: int | None = None) -> None:
         binary = paths.binary("rt_hub")
         self.counters: dict = {}
+        self.refused = ""
         self._folder = runtime_dir()
         self.socket_path = self._folder / "bus"
         self.child: Child | None = None
@@ -186,9 +190,17 @@ class HubProcess:
             command = [str(binary), "--socket", str(self.socket_path), "--stall-s", f"{stall_s:g}"]
             self.child = Child("hub", command, cores)
             self.child.wait_line("ready", _HUB_READY_S)
+            if priority is not None:
+                self._raise_priority(self.child.process.pid, priority)
         except BaseException:
             self.stop()
             raise
+
+    def _raise_priority(self, pid: int, priority: int) -> None:
+        try:
+            os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(priority))
+        except OSError as e:
+            self.refused = f"SCHED_FIFO priority {priority} refused ({e.strerror}): frames wait for the processor"
 
     @property
     def bus(self) -> str:
@@ -220,16 +232,22 @@ class HubProcess:
     @staticmethod
     @contextlib.contextmanager
     def serving(
-        choice: BusChoice, say: Callable[[str], None] | None = None, cores: set[int] | None = None
+        choice: BusChoice,
+        say: Callable[[str], None] | None = None,
+        cores: set[int] | None = None,
+        priority: int | None = None,
     ) -> Iterator[str]:
         """Have the chosen bus for the length of a ``with``: start the hub if it is one, give the bus string.
 
-        ``say`` is told in one line if the hub was lost or had to disconnect a client; ``cores`` are those of the hub.
+        ``say`` is told in one line if the hub was refused its priority, was lost or had to disconnect a client;
+        ``cores`` and ``priority`` are those of the hub.
         """
         if choice.kind != "rt_hub" or choice.channel:
             yield choice.bus
             return
-        hub = HubProcess(cores=cores)
+        hub = HubProcess(cores=cores, priority=priority)
+        if hub.refused and say is not None:
+            say(f"warning: hub: {hub.refused}")
         try:
             yield hub.bus
         finally:

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from rt_runner import machine, paths
-from rt_runner.bus import BusChoice, HubProcess
+from rt_runner.bus import HUB_PRIORITY, BusChoice, HubProcess
 from rt_runner.children import Child, ChildError
 from rt_runner.config import Scenario
 from rt_runner.controller import controller_command, preview
@@ -79,7 +79,8 @@ class Supervisor:
         with contextlib.ExitStack() as stack:
             if self._plan.scenario.controller.present:
                 self._road = stack.enter_context(preview(self._plan.scenario))
-            bus = stack.enter_context(HubProcess.serving(self._plan.bus, self._say, self._others))
+            priority = HUB_PRIORITY if self._plan.realtime else None
+            bus = stack.enter_context(HubProcess.serving(self._plan.bus, self._say, self._others, priority))
             try:
                 logger = self._start_logger(bus)
                 if bus.startswith("rt_hub:"):

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from rt_runner import machine
-from rt_runner.bus import HubProcess, choose_bus
+from rt_runner.bus import HUB_PRIORITY, HubProcess, choose_bus
 from rt_runner.errors import RtError
 from tools.bench_loop_figures import lines, markdown, of_period, targets
 from tools.bench_loop_slices import PRIORITY, Bench, Kind, Slice, SliceError
@@ -62,7 +62,7 @@ def bench(args: argparse.Namespace, shown: TextIO) -> dict[str, Any]:
     print(f"bus: {choice.name}, {choice.reason}", file=shown)
     load_before = os.getloadavg()[0]
     found: dict[str, dict[Kind, list[Slice]]] = {}
-    with HubProcess.serving(choice, lambda text: print(text, file=sys.stderr), others) as bus:
+    with HubProcess.serving(choice, lambda text: print(text, file=sys.stderr), others, HUB_PRIORITY) as bus:
         bench = Bench(bus, core, others, slice_s)
         if Kind.FRAME not in bench.kinds:
             print("this rt_estimator has no --trigger frame: not measured", file=shown)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 
 from rt_runner import machine
-from rt_runner.bus import BusChoice, HubProcess, can_trouble, choose_bus, open_bus
+from rt_runner.bus import HUB_PRIORITY, BusChoice, HubProcess, can_trouble, choose_bus, open_bus
 from rt_runner.errors import SetupError
 
 REQUIRE_VCAN = "RT_REQUIRE_VCAN"
@@ -72,7 +72,7 @@ def virtual_bus(wanted: str = "auto") -> Iterator[VirtualBus]:
     choice = _choose(wanted)
     lost: list[str] = []
     _, others = machine.split_cores()
-    with _turn(choice), HubProcess.serving(choice, lost.append, others) as bus:
+    with _turn(choice), HubProcess.serving(choice, lost.append, others, HUB_PRIORITY) as bus:
         made = VirtualBus(choice, bus)
         try:
             yield made

@@ -472,3 +472,33 @@ def test_hub_process_that_cannot_start_is_one_line(built_hub):
 def test_serving_a_kernel_bus_starts_nothing():
     with HubProcess.serving(BusChoice("socketcan", "vcan0", "asked for")) as bus:
         assert bus == "socketcan:vcan0"
+
+
+def test_the_hub_has_the_priority_it_was_granted():
+    said = []
+    with HubProcess.serving(BusChoice("rt_hub", "", ""), said.append, priority=7) as bus:
+        pids = [int(p.parent.name) for p in Path("/proc").glob("[0-9]*/cmdline") if bus[7:].encode() in _words(p)]
+        policies = {(os.sched_getscheduler(pid), os.sched_getparam(pid).sched_priority) for pid in pids}
+    assert policies == ({(os.SCHED_OTHER, 0)} if said else {(os.SCHED_FIFO, 7)})
+    assert all("SCHED_FIFO priority 7 refused" in text for text in said)
+
+
+def test_a_priority_that_is_refused_is_said_and_the_bus_serves_all_the_same(monkeypatch):
+    def refuse(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    said = []
+    with HubProcess.serving(BusChoice("rt_hub", "", ""), said.append, priority=7) as bus, open_bus(bus) as reader:
+        with open_bus(bus, receive=False) as sender:
+            sender.send(message(0x123))
+        assert reader.recv(5.0).arbitration_id == 0x123
+    assert len(said) == 1
+    assert said[0].startswith("warning: hub: SCHED_FIFO priority 7 refused (Operation not permitted)")
+
+
+def _words(cmdline: Path) -> list[bytes]:
+    try:
+        return cmdline.read_bytes().split(b"\0")
+    except OSError:
+        return []
