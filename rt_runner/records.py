@@ -27,9 +27,13 @@ def control(t_ns: int, code: int) -> bytes:
     return pack(t_ns, CONTROL_ID, bytes([code]))
 
 
-def job(t_ns: int, release: int) -> bytes:
-    """The control record of replay: the job of release number ``release`` read its inputs at ``t_ns``."""
-    return pack(t_ns, CONTROL_ID, bytes([JOB]) + release.to_bytes(4, "little"))
+def job(t_ns: int, release: int, output: int = 0, sweep_limit: int = 0) -> bytes:
+    """The control record of replay: the job of release number ``release`` read its inputs at ``t_ns``.
+
+    ``output`` is what it put out, as the signal of that name; its solver's time was up after ``sweep_limit`` sweeps
+    (0: it was not).
+    """
+    return pack(t_ns, CONTROL_ID, bytes([JOB]) + release.to_bytes(4, "little") + bytes([output, sweep_limit]))
 
 
 def read_until_control(stream: IO[bytes]) -> Iterator[Record]:

@@ -477,7 +477,12 @@ static int replay_job(const rt_record *record) {
         return fail("stdin: release %lu comes after release %lu; jobs are replayed in their order", (unsigned long)index,
                     (unsigned long)cycle.task.last_index);
     }
-    return est_cycle_run_replayed(&cycle, index, record->t_ns) == EST_CYCLE_OK ? -1 : reader_left();
+    const est_replayed as = {(timing_output)bytes[5], bytes[6]};
+    if (bytes[5] > TIMING_OUTPUT_INVALID) {
+        return fail("stdin: release %lu put out %u; give 0 to %d, as the signal output", (unsigned long)index,
+                    (unsigned)bytes[5], TIMING_OUTPUT_INVALID);
+    }
+    return est_cycle_run_replayed(&cycle, index, record->t_ns, &as) == EST_CYCLE_OK ? -1 : reader_left();
 }
 
 /* Handles one record. *done at END. Returns an exit status, or -1 to go on. */

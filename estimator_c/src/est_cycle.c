@@ -191,10 +191,15 @@ static est_cycle_status publish_timing(est_cycle *self, const rt_job *job, timin
 typedef struct {
     rt_task *task;
     rt_job *job;
+    uint32_t limit; /* replay: time is up at this question; 0: the task knows */
+    uint32_t asked;
 } budget;
 
 static bool expired(void *ctx) {
-    const budget *self = ctx;
+    budget *self = ctx;
+    if (self->limit > 0) {
+        return ++self->asked >= self->limit;
+    }
     return rt_task_expired(self->task, self->job);
 }
 
@@ -226,14 +231,14 @@ static void invalidate(est_output *output) {
 }
 
 /* What is put out in place of an estimate that is late already. */
-static timing_output stand_in(est_cycle *self, const estimator_base_t *base, estimator_out_t *out, bool motor_stale,
+static timing_output stand_in(est_cycle *self, est_on_miss on_miss, const estimator_base_t *base, estimator_out_t *out, bool motor_stale,
                               est_output *output) {
-    if (self->on_miss == EST_ON_MISS_HOLD && self->has_last) {
+    if (on_miss == EST_ON_MISS_HOLD && self->has_last) {
         *output = self->last_in_time;
         output->innov_w_degc = output->innov_r_degc = (double)NAN;
         return TIMING_OUTPUT_HELD;
     }
-    if (self->on_miss == EST_ON_MISS_PREDICT && estimator_predict(&self->estimator, base, out)) {
+    if (on_miss == EST_ON_MISS_PREDICT && estimator_predict(&self->estimator, base, out)) {
         *output = output_of(out, motor_stale);
         return TIMING_OUTPUT_PREDICTED;
     }
@@ -241,13 +246,27 @@ static timing_output stand_in(est_cycle *self, const estimator_base_t *base, est
     return TIMING_OUTPUT_INVALID;
 }
 
+/* What the job puts out if it is late now; EST_ON_MISS_LATE: what it computed. */
+static est_on_miss reaction(est_cycle *self, const rt_job *job) {
+    static const est_on_miss replayed[] = {[TIMING_OUTPUT_COMPUTED] = EST_ON_MISS_LATE,
+                                           [TIMING_OUTPUT_HELD] = EST_ON_MISS_HOLD,
+                                           [TIMING_OUTPUT_PREDICTED] = EST_ON_MISS_PREDICT,
+                                           [TIMING_OUTPUT_INVALID] = EST_ON_MISS_INVALID};
+    if (self->replayed != NULL) {
+        return replayed[self->replayed->output];
+    }
+    const bool late = self->on_miss != EST_ON_MISS_LATE && rt_task_late_now(&self->task, job);
+    return late ? self->on_miss : EST_ON_MISS_LATE;
+}
+
 static timing_output choose_output(est_cycle *self, const rt_job *job, const estimator_base_t *base, estimator_out_t *out,
                                    est_output *output) {
     const bool motor_stale = est_bus_is_stale(&self->bus, EST_RX_MOTOR_STATE);
     timing_output put_out = TIMING_OUTPUT_COMPUTED;
     *output = output_of(out, motor_stale);
-    if (self->on_miss != EST_ON_MISS_LATE && rt_task_late_now(&self->task, job)) {
-        put_out = stand_in(self, base, out, motor_stale, output);
+    const est_on_miss on_miss = reaction(self, job);
+    if (on_miss != EST_ON_MISS_LATE) {
+        put_out = stand_in(self, on_miss, base, out, motor_stale, output);
     } else {
         self->last_in_time = *output;
         self->has_last = true;
@@ -258,7 +277,7 @@ static timing_output choose_output(est_cycle *self, const rt_job *job, const est
 
 /* `now_ns`: when the inputs are read. In lock-step record time stands still while a job runs; in real time it is when we woke. */
 static est_cycle_status run(est_cycle *self, rt_job *job, int64_t now_ns, est_cycle_status read_status) {
-    budget left = {&self->task, job};
+    budget left = {&self->task, job, self->replayed != NULL ? self->replayed->sweep_limit : 0, 0};
     estimator_base_t base;
     estimator_out_t out;
     est_output output;
@@ -272,7 +291,8 @@ static est_cycle_status run(est_cycle *self, rt_job *job, int64_t now_ns, est_cy
     const bool bus_stale = est_bus_stale(&self->bus, now_ns, job->index);
     make_faults(self, job);
     estimator_base(&self->estimator, &base);
-    estimator_step_within(&self->estimator, &out, self->task.config.reaction.budget_ns > 0 ? expired : NULL, &left);
+    const bool limited = left.limit > 0 || self->task.config.reaction.budget_ns > 0;
+    estimator_step_within(&self->estimator, &out, limited ? expired : NULL, &left);
     const bool stale = bus_stale || out.stale_input;
     self->stale_jobs += stale ? 1U : 0U;
     self->calibration = out.calibration;
@@ -346,9 +366,12 @@ est_cycle_status est_cycle_run_released(est_cycle *self) {
     return run(self, &job, job.release_ns, EST_CYCLE_OK);
 }
 
-est_cycle_status est_cycle_run_replayed(est_cycle *self, uint64_t index, int64_t now_ns) {
+est_cycle_status est_cycle_run_replayed(est_cycle *self, uint64_t index, int64_t now_ns, const est_replayed *as) {
     rt_job job;
     self->task.next_index = index;
+    self->replayed = as;
     rt_task_release(&self->task, &job);
-    return run(self, &job, now_ns, EST_CYCLE_OK);
+    const est_cycle_status status = run(self, &job, now_ns, EST_CYCLE_OK);
+    self->replayed = NULL;
+    return status;
 }

@@ -49,6 +49,12 @@ typedef enum {
 } est_on_miss;
 
 /* Up to 800 kB (checked where it is compiled): belongs in static storage. */
+/* What a logged job did that follows from no input: time decided it. */
+typedef struct {
+    timing_output output;
+    uint8_t sweep_limit; /* the solver's time was up when it asked for the n-th time, after n sweeps; 0: it was not */
+} est_replayed;
+
 typedef struct {
     rt_task task;
     est_bus bus;
@@ -62,6 +68,7 @@ typedef struct {
     size_t round_end;           /* none left when round_next has come here */
     estimator_calibration_t calibration; /* of the newest job */
     est_on_miss on_miss;
+    const est_replayed *replayed; /* while a job is replayed; otherwise NULL */
     est_output last_in_time;    /* what EST_ON_MISS_HOLD repeats */
     bool has_last;
     uint64_t output_jobs[4];    /* jobs by timing_output */
@@ -106,8 +113,8 @@ est_cycle_status est_cycle_wait_and_run(est_cycle *self);
 est_cycle_status est_cycle_run_released(est_cycle *self);
 
 /* Replay (virtual time): runs the job of release `index`, after the one before, that read its inputs at `now_ns`. Releases
- * left out have no job. The same frames with the same arrival times give the same estimates as they did in real time. */
-est_cycle_status est_cycle_run_replayed(est_cycle *self, uint64_t index, int64_t now_ns);
+ * left out have no job; lateness is what `as` says. The same frames with the same arrival times give the same estimates as they did in real time. */
+est_cycle_status est_cycle_run_replayed(est_cycle *self, uint64_t index, int64_t now_ns, const est_replayed *as);
 
 /* The counters as they are published. O(1). */
 void est_cycle_counters(const est_cycle *self, est_counters *out);

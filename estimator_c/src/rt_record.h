@@ -14,7 +14,8 @@ enum {
     RT_RECORD_CONTROL_ID = 0x20000000, /* CAN_ERR_FLAG alone: no data frame can have it */
     RT_RECORD_TICK = 1,                /* time has advanced to t_ns, everything before has been delivered */
     RT_RECORD_END = 2,
-    RT_RECORD_JOB = 3,                 /* replay: a job read its inputs at t_ns; data[1..4]: its release, little endian */
+    RT_RECORD_JOB = 3,                 /* replay: a job read its inputs at t_ns; data[1..4]: its release, little endian;
+                                        * data[5]: what it put out (signal `output`); data[6]: est_replayed.sweep_limit */
     RT_RECORD_BUFFER = 64 * 1024
 };
 

@@ -117,7 +117,7 @@ class Evidence:
     def _motor(self, job: Job, start_ns: int, last: int) -> int | None:
         """Position of the newest MotorState used; None if nothing says which it was."""
         wanted: list[int] = []
-        if job.tick is not None and job.output in (0, 2):
+        if job.tick is not None and job.output == 0:  # what was held or predicted has another's tick
             wanted = [k for k in self._by_tick.get(job.tick, ()) if k < last]
         if not wanted and job.age_motor_ns is not None:
             wanted = self._motors[: bisect_right(self._motors, last - 1)]

@@ -12,13 +12,15 @@ from rt_runner.records import pack
 from rt_runner.replay.cuts import Evidence, arrival_ns
 from rt_runner.replay.differ import Comparison, Difference, compare
 from rt_runner.replay.engine import Answer, run_engine
-from rt_runner.replay.session import Session, missing_jobs, raw_of, read_session, signal_of
+from rt_runner.replay.session import Job, Session, missing_jobs, raw_of, read_session, signal_of
 
 MOST_ATTEMPTS, FEW_ATTEMPTS = 64, 8
 LOOK_AHEAD = 50  # jobs behind a difference that another reading must explain before the whole log is tried
 JOINED_JOBS = 30  # that a guess of the first frame seen must explain
 JOINED_FRAMES = 200  # motor frames before the first job among which the first one seen is looked for
 QUEUE = 4096  # frames the estimator keeps between two jobs
+MOST_SWEEPS = 12  # of which a cut job tried to make more
+HELD = 1
 
 
 @dataclass
@@ -115,14 +117,15 @@ class Replayer:
                 records.append(job_record(t_ns - self._base_ns, release))
                 done = upto
             cut = evidence.cut(k, done)
-            if len(cut.options) > 1:
-                open_jobs[k] = len(cut.options)
-            upto = cut.options[min(reading.choice.get(k, 0), len(cut.options) - 1)]
+            options = [(upto, limit) for limit in _sweep_limits(job) for upto in cut.options]
+            if len(options) > 1:
+                open_jobs[k] = len(options)
+            upto, limit = options[min(reading.choice.get(k, 0), len(options) - 1)]
             for position in range(max(done, upto - QUEUE), upto):
                 f = inputs[position]
                 at_ns = arrival_ns(job, cut, position, f.t_ns, self._timeout_ns)
                 records.append(pack(at_ns - self._base_ns, f.can_id, f.data))
-            records.append(job_record(cut.start_ns - self._base_ns, job.release))
+            records.append(job_record(cut.start_ns - self._base_ns, job.release, job.output, limit))
             done, release = upto, job.release
         return records, open_jobs
 
@@ -198,6 +201,17 @@ class Replayer:
             if name in j.frames and j.release in again
         ]
         return not told or told[-1][0] != told[-1][1]
+
+
+def _sweep_limits(job: Job) -> list[int]:
+    """After how many sweeps the solver's time may have been up: as published; more where it solved several windows.
+
+    A held output repeats an older job's sweeps and tells nothing.
+    """
+    if not job.cut:
+        return [0]
+    first = job.sweeps if job.output != HELD and job.sweeps > 0 else 1
+    return [first, *(n for n in range(1, MOST_SWEEPS + 1) if n != first)]
 
 
 def _further(one: Attempt, other: Attempt) -> Attempt:
