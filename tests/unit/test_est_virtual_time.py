@@ -231,7 +231,8 @@ def check(
         assert times == (*map(tenths, (want.wake_lat_ns, want.exec_wall_ns, want.resp_ns, want.exec_cpu_ns)),)
         assert ("Estimate" in frames[number]) == bool(step["sent"])
     total, last = model.counters("total"), frames[-1]
-    assert last["EstReleases"] == {**last["EstReleases"], "releases": total["releases"], "jobs": total["jobs"]}
+    releases = {"releases": total["releases"] - total["queued_now"], "jobs": total["jobs"]}  # those decided
+    assert {name: last["EstReleases"][name] for name in releases} == releases
     misses = {name: total[name] for name in ("miss_late", "miss_skipped", "overrun")}
     assert {name: last["EstMisses"][name] for name in misses} == misses
     assert last["EstMissRun"]["consec_miss_max"] == total["consec_miss_max"]
@@ -313,7 +314,7 @@ est_settings = st.builds(
 )
 
 
-@settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     est_settings,
     st.sampled_from(ON_MISS),
