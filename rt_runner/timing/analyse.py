@@ -17,6 +17,7 @@ from rt_runner.timing.audit import COUNTERS, Audit, Books, audit
 from rt_runner.timing.columns import LogColumns, read_columns
 from rt_runner.timing.cycles import CycleRow, Expected, cycle_rows, expected_cycles
 from rt_runner.timing.jobs import NO_NS, TIMING_SIGNALS, Jobs, Process, collect, processes
+from rt_runner.timing.lives import lives
 from rt_runner.timing.metrics import derive, summaries
 from rt_runner.timing.misses import MissAccount, account
 from rt_runner.timing.setup import TimingSetup, final_of, setup_of
@@ -34,6 +35,8 @@ class ProcessTiming:
     """
 
     process: Process
+    period_ns: int
+    deadline_ns: int
     jobs: Jobs
     account: MissAccount
     windows: dict[str, dict[str, Summary]]
@@ -76,8 +79,8 @@ def analyse(path: str | Path) -> TimingReport:
     found = processes(log)
     if not found:
         raise LogError(f"{path}: no timing frames of a real-time process in it; give a log of rt-runner run or mil")
-    timings = [_process(reader, log, p, setup) for p in found]
-    cycles = _cycles(reader, log, setup)
+    timings = _timings(reader, log, found, setup)
+    cycles = _cycles(reader, log, setup, timings)
     findings = [*(f for t in timings for f in t.findings), _log_finding(reader, setup)]
     if setup.facts.crash:
         findings.append(Finding("run", "fail", setup.facts.crash))
@@ -102,14 +105,32 @@ def _wanted(reader: LogReader) -> dict[str, tuple[str, ...]]:
         if kind.endswith("Timing") and letter in TIMING_SIGNALS:
             ages = (u.partition("=")[0] for u in about.get("units", "").split(","))
             wanted[name] = (*TIMING_SIGNALS[letter], *(a for a in ages if a.startswith("in_age_")))
-        for message, signals in (*COUNTERS.items(), *((s, ("p99_us", "max_us")) for s in STATISTICS)):
+        once = (*COUNTERS.items(), *((s, ("p99_us", "max_us")) for s in STATISTICS), ("Granted", ("period_us",)))
+        for message, signals in once:
             if name.endswith(message) and about.get("sender", "") not in ("", "PLANT"):
                 wanted[name] = signals
     return wanted
 
 
-def _process(reader: LogReader, log: LogColumns, process: Process, setup: TimingSetup) -> ProcessTiming:
+def _timings(reader: LogReader, log: LogColumns, found: list[Process], setup: TimingSetup) -> list[ProcessTiming]:
+    """One after the other: a drop that the logger counted excuses one missing frame of one of them."""
+    out: list[ProcessTiming] = []
+    others = frozenset(p.sender for p in found)  # the plant keeps no books: its frames are looked at with the first
+    left = setup.facts.log_dropped
+    for process, part in (life for p in found for life in lives(log, p)):
+        out.append(_process(reader, part, process, setup.with_drops(max(left, 0)), others))
+        left -= out[-1].audit.charged
+        others = frozenset(c.sender for c in log.columns.values())
+    return out
+
+
+def _process(
+    reader: LogReader, log: LogColumns, process: Process, setup: TimingSetup, keepers: frozenset[str]
+) -> ProcessTiming:
     jobs = collect(log, process)
+    told_us = _newest(log, f"{process.prefix}Granted").get("period_us")  # each process may have a period of its own
+    if told_us is not None:
+        setup = setup.with_period(round(told_us * 1e3))
     derive(jobs, setup.deadline_ns)
     misses = account(jobs)
     final = final_of(reader, process.final)
@@ -133,10 +154,13 @@ def _process(reader: LogReader, log: LogColumns, process: Process, setup: Timing
         period_ns=setup.period_ns,
         deadline_ns=setup.deadline_ns,
         rebased=rebased,
+        bookkeepers=keepers,
     )
     done = audit(books)
     return ProcessTiming(
         process=process,
+        period_ns=setup.period_ns,
+        deadline_ns=setup.deadline_ns,
         jobs=jobs,
         account=misses,
         windows=summaries(jobs, ages, setup.period_ns),
@@ -207,13 +231,15 @@ def _log_finding(reader: LogReader, setup: TimingSetup) -> Finding:
     return Finding("log", "pass", "finished in order")
 
 
-def _cycles(reader: LogReader, log: LogColumns, setup: TimingSetup) -> list[CycleRow]:
+def _cycles(reader: LogReader, log: LogColumns, setup: TimingSetup, timings: list[ProcessTiming]) -> list[CycleRow]:
     """Cyclic messages against the DBC that the log carries."""
     text = reader.attachments.get("drive.dbc")
     if text is None:
         return []
     try:
-        expected = _expected(text, setup.period_ns / 1e9)
+        periods = {t.process.sender: t.period_ns for t in timings}
+        senders = dict.fromkeys(c.sender for c in log.columns.values())
+        expected = [e for s in senders for e in _expected(text, periods.get(s, setup.period_ns) / 1e9) if e.sender == s]
     except RtError as e:
         reader.trouble.append(f"its attachment drive.dbc: {e}")
         return []

@@ -6,7 +6,6 @@
 A frame that is missing and that nobody counted as dropped breaks the books: the audit fails, whatever else is fine.
 """
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -52,6 +51,7 @@ class Books:
     period_ns: int = 0
     deadline_ns: int = 0
     rebased: int = 0
+    bookkeepers: frozenset[str] = frozenset()  # senders that have an audit of their own
 
     def own(self, message: str, signal: str) -> int | None:
         """Newest value of a counter that the process sends once a second."""
@@ -63,6 +63,12 @@ class Books:
     def said(self, key: str, message: str, signal: str) -> int | None:
         """The last words' figure, else the newest counter frame's."""
         return int(self.final[key]) if self.final is not None and key in self.final else self.own(message, signal)
+
+    @property
+    def columns(self) -> list[Column]:
+        """Messages of this process, and of who keeps no books of his own (the plant)."""
+        own = self.jobs.process.sender
+        return [c for c in self.log.columns.values() if c.sender == own or c.sender not in self.bookkeepers]
 
     @property
     def whole(self) -> bool:
@@ -77,6 +83,7 @@ class Audit:
     checks: list[Check] = field(default_factory=list)
     missing: list[Missing] = field(default_factory=list)
     drops: dict[str, int] = field(default_factory=dict)
+    charged: int = 0  # missing frames that only the logger's drops can excuse
 
     @property
     def ok(self) -> bool:
@@ -97,7 +104,7 @@ class Audit:
 
 def audit(books: Books) -> Audit:
     """Make all checks."""
-    found = missing_frames(books.log.columns.values(), books.from_start)
+    found = missing_frames(books.columns, books.from_start)
     missing = [replace(m, release=_release(books.jobs, m)) for m in found]
     drops = _drops(books)
     checks = [
@@ -111,7 +118,7 @@ def audit(books: Books) -> Audit:
         *histogram_checks(books.final, books.jobs, books.account, books.deadline_ns, books.rebased),
         _monotonic(books),
     ]
-    return Audit(checks, missing, drops)
+    return Audit(checks, missing, drops, _charged(books, missing, drops))
 
 
 def _release(jobs: Jobs, missing: Missing) -> int | None:
@@ -139,32 +146,34 @@ def _file(books: Books) -> Check:
         total = sum(abs(n) for _, n in gaps)
         says = f"{total} frames are not in the file, the first after frame number {before} ({count})"
         return Check("file", False, says)
-    decoded = sum(len(c) for c in log.columns.values())
-    if books.logged is not None and decoded != books.logged:
-        return Check("file", False, f"the logger counted {books.logged} frames of the DBC, {decoded} are in the file")
+    if books.logged is not None and log.decoded != books.logged:
+        says = f"the logger counted {books.logged} frames of the DBC, {log.decoded} are in the file"
+        return Check("file", False, says)
     return Check("file", True, f"{log.raw_frames} frames, numbered without a gap")
 
 
 def _counters(books: Books, missing: list[Missing], drops: Mapping[str, int]) -> Check:
     """Frames missing by their E2E counters against frames counted as dropped."""
-    by_sender = Counter()
-    for m in missing:
-        by_sender[m.sender] += m.count
-    bad = sum(1 for c in books.log.columns.values() for _ in damaged(c))
+    bad = sum(1 for c in books.columns for _ in damaged(c))
     tail = f"; {bad} damaged" if bad else ""
     counted = ", ".join(f"{n} {who}" for who, n in drops.items() if n)
     if not missing:
         says = "no frame missing by its counter" + (f"; counted as dropped: {counted}" if counted else "") + tail
         return Check("frames", True, says)
     named = "; ".join(m.text() for m in missing[:NAMED]) + ("; …" if len(missing) > NAMED else "")
-    own = books.jobs.process.sender
-    left = sum(n for s, n in by_sender.items() if s != own)
-    left += max(0, by_sender[own] - drops[f"{books.jobs.process.name}_tx"])
-    total = by_sender.total()
+    left = _charged(books, missing, drops)
+    total = sum(m.count for m in missing)
     if left <= drops["logger"]:
         return Check("frames", True, f"{total} frames missing, all counted as dropped ({counted}): {named}{tail}")
     says = f"{total} frames missing, {left - drops['logger']} of them counted by nobody"
     return Check("frames", False, f"{says} ({counted or 'no drops counted'}): {named}{tail}")
+
+
+def _charged(books: Books, missing: list[Missing], drops: Mapping[str, int]) -> int:
+    """Missing frames that the bus did not refuse to their sender."""
+    own = sum(m.count for m in missing if m.sender == books.jobs.process.sender)
+    refused = min(own, drops[f"{books.jobs.process.name}_tx"])
+    return sum(m.count for m in missing) - refused
 
 
 def _conservation(books: Books) -> Iterator[Check]:

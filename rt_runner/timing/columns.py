@@ -81,6 +81,7 @@ class LogColumns:
     raw_order_gaps: list[tuple[int, int]] = field(default_factory=list)
     first_ns: int | None = None
     last_ns: int | None = None
+    decoded: int = 0  # frames of the DBC
 
     def __getitem__(self, name: str) -> Column:
         """The message's column; an empty one where the log does not know it."""
@@ -141,6 +142,7 @@ def read_columns(reader: LogReader, wanted: Mapping[str, Collection[str]], defau
     for table in tables.values():
         if table is not None:
             log.columns[table.column.name] = table.finish()
+            log.decoded += len(table.column)
     return log
 
 

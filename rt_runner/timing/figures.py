@@ -39,6 +39,8 @@ def as_json(report: TimingReport) -> dict[str, Any]:
     }
     for p in report.processes:
         out[p.process.name] = {
+            "period_us": p.period_ns / 1e3,
+            "deadline_us": p.deadline_ns / 1e3,
             "windows": {w: {m: s.as_json() for m, s in rows.items()} for w, rows in p.windows.items()},
             "misses": {
                 "since_start": p.account.judged.as_json(),
@@ -55,8 +57,8 @@ def as_json(report: TimingReport) -> dict[str, Any]:
     out["audit"] = {
         "ok": all(a.ok for a in audits),
         "checks": [{"process": p.process.name, **vars(c)} for p in report.processes for c in p.audit.checks],
-        "missing": audits[0].as_json()["missing"] if audits else [],
-        "drops": {k: v for a in audits for k, v in a.drops.items()},
+        "missing": [m.as_json() for a in audits for m in a.missing],
+        "drops": {**{k: v for a in audits for k, v in a.drops.items()}, "logger": setup.facts.log_dropped},
     }
     return out
 

@@ -27,20 +27,24 @@ CEILING_NS = 1_677_721_400  # largest time a frame can carry; what is longer is 
 
 @dataclass(frozen=True)
 class Process:
-    """Which frames tell of a process: ``prefix`` + TimingA to D per job, ``prefix`` + Releases … once a second."""
+    """Which frames tell of a process: ``prefix`` + TimingA to D per job, ``prefix`` + Releases … once a second.
 
-    name: str  # in results: "estimator"
+    ``life`` counts from 1 the lives of a process that was started again; the last one, or the only one, has 0.
+    """
+
     prefix: str
     sender: str
+    life: int = 0
 
     @property
-    def final(self) -> str:
-        """Attachment with its last words."""
-        return f"{self.prefix_word}_final.json"
+    def name(self) -> str:
+        """In results: ``controller``; of an earlier life ``controller_1``."""
+        return self.sender.lower() + (f"_{self.life}" if self.life else "")
 
     @property
-    def prefix_word(self) -> str:
-        return self.sender.lower()
+    def final(self) -> str | None:
+        """Attachment with its last words; who was killed has none."""
+        return None if self.life else f"{self.sender.lower()}_final.json"
 
 
 @dataclass
@@ -73,7 +77,7 @@ def processes(log: LogColumns) -> list[Process]:
     found = []
     for name, column in log.columns.items():
         if name.endswith("TimingA") and len(column):
-            found.append(Process(column.sender.lower(), name.removesuffix("TimingA"), column.sender))
+            found.append(Process(name.removesuffix("TimingA"), column.sender))
     return found
 
 

@@ -4,7 +4,7 @@ import json
 import tomllib
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from rt_runner.log_reader import LogReader
@@ -28,6 +28,15 @@ class TimingSetup:
     trigger: str = "time"
     mk: tuple[int, int] | None = None
     logged: int | None = None  # frames of the DBC, by the logger's own count
+
+    def with_period(self, period_ns: int) -> "TimingSetup":
+        """The same for a process with another period; a deadline of one period stays one."""
+        deadline_ns = period_ns if self.deadline_ns == self.period_ns else self.deadline_ns
+        return replace(self, period_ns=period_ns, deadline_ns=deadline_ns)
+
+    def with_drops(self, log_dropped: int) -> "TimingSetup":
+        """The same with so many frames dropped by the logger."""
+        return replace(self, facts=replace(self.facts, log_dropped=log_dropped))
 
     @property
     def queue(self) -> int:
@@ -71,9 +80,11 @@ def _logged(reader: LogReader) -> int | None:
     return None
 
 
-def final_of(reader: LogReader, name: str) -> dict[str, Any] | None:
+def final_of(reader: LogReader, name: str | None) -> dict[str, Any] | None:
     """Last words of a process, None where the log has none."""
     with suppress(KeyError, ValueError):
+        if name is None:
+            return None
         words = json.loads(reader.attachments[name])
         return words if isinstance(words, dict) else None
     return None

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rt_runner.cli import main
+from rt_runner.codec import Encoder
 from rt_runner.log_reader import LogReader
 from rt_runner.mcap_log import LogWriter
 from rt_runner.timing.analyse import TimingReport, analyse
@@ -248,3 +249,32 @@ def test_exit_status_and_json(whole, tmp_path, capsys):
     assert main(["timing", str(strict)]) == 2
     assert main(["timing", str(tmp_path / "none.mcap")]) == 1
     assert main(["timing", str(path), "--json", str(tmp_path / "no" / "x.json")]) == 1
+
+
+def test_a_process_that_was_started_again_has_two_lives(whole, tmp_path):
+    """Killed in the middle of a second, started again: both lives balance, and a frame of either is missed."""
+    _, frames, final = whole
+    first = [f for f in logs.job_frames(logs.regular(37), plant=False) if f[1] in logs.PER_JOB]
+    ahead_ns = 2_000_000_000
+    second = [(t + ahead_ns, n, v) for t, n, v in frames if logs.dbc()[n].sender == "ESTIMATOR"]
+
+    def written(name: str, gone: tuple[int, int] = (-1, -1)) -> TimingReport:
+        """As two processes would: each counts its frames from the start."""
+        encoders = [Encoder(logs.dbc(), "ESTIMATOR") for _ in range(2)]
+        files = {"estimator_final.json": json.dumps(final).encode()}
+        run = {"scenario": "x", "period_s": logs.PERIOD_NS / 1e9}
+        with LogWriter(tmp_path / name, logs.dbc(), run, files) as writer:
+            for life, part in enumerate((first, second)):
+                for i, (t_ns, message, values) in enumerate(part):
+                    frame = encoders[life].encode(message, values)
+                    if (life, i) != gone:
+                        writer.write(t_ns, frame.arbitration_id, bytes(frame.data))
+            writer.seal({"bus": "hub", "period_s": logs.PERIOD_NS / 1e9}, {})
+        return analyse(tmp_path / name)
+
+    report = written("a.mcap")
+    assert [p.process.name for p in report.processes] == ["estimator_1", "estimator"]
+    assert [len(p.jobs) for p in report.processes] == [37, len(script())]
+    assert [p.audit.ok for p in report.processes] == [True, True], [p.audit.failed for p in report.processes]
+    assert [p.audit.ok for p in written("b.mcap", (0, 100)).processes] == [False, True]
+    assert [p.audit.ok for p in written("c.mcap", (1, 100)).processes] == [True, False]

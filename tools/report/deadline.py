@@ -51,10 +51,10 @@ def panels(p: ProcessTiming, report: TimingReport) -> list[str]:
         column = p.jobs.times.get(metric) or p.ages.get(metric)
         values = np.frombuffer(column, dtype=np.int64) if column is not None else np.empty(0, dtype=np.int64)
         known = values != NO_NS if values.size else np.zeros(0, dtype=bool)
-        if metric == "e2e" and not known.any() and p.process.name != "estimator":
+        if metric == "e2e" and not known.any() and p.process.sender != "ESTIMATOR":
             continue
         judged, before = (known & ~warm, known & warm) if values.size else (known, known)
-        deadline = report.setup.deadline_ns if has_deadline and not report.setup.facts.lockstep else None
+        deadline = p.deadline_ns if has_deadline and not report.setup.facts.lockstep else None
         at = releases[judged] if values.size else values
         out.append(panel(Duration(title, colour, values[judged], at, values[before], deadline)))
     return out
