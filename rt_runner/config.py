@@ -11,6 +11,7 @@ from pathlib import Path
 
 from rt_runner.errors import UsageError
 from rt_runner.result import Limits
+from rt_runner.timing_config import TimingConfig, check_timing, timing_from
 
 TICK_S = 0.01  # the plant's step
 START_MAX_S = 10_800.0
@@ -51,10 +52,14 @@ class SensorConfig:
 
 @dataclass(frozen=True)
 class EstimatorConfig:
-    """Which named setting of the estimator, and the period of its loop."""
+    """Which named setting of the estimator, the period of its loop, and what releases its jobs.
+
+    ``trigger``: "time", the grid of the period, or "frame", each TempMeas on its arrival.
+    """
 
     setting: str = "default"
     period_s: float = 0.1
+    trigger: str = "time"
 
 
 CONTROLLERS = ("none", "rule-150-155", "rule-145-160", "mpc-S", "mpc-M", "paper")
@@ -93,6 +98,7 @@ class Scenario:
     sensor: SensorConfig = field(default_factory=SensorConfig)
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
     controller: ControllerConfig = field(default_factory=ControllerConfig)
+    timing: TimingConfig = field(default_factory=TimingConfig)
     limits: Limits = field(default_factory=Limits)
     plant: PlantConfig = field(default_factory=PlantConfig)
     faults: tuple[str, ...] = ()
@@ -152,6 +158,10 @@ def _build(tree: dict, name: str, path: Path, raw: bytes) -> Scenario:
             if not isinstance(value, dict):
                 raise UsageError(f"scenario {path}: '{key}' must be a table")
             values[key] = _table(tables[key], value, f"scenario {path}, [{key}]")
+        elif key == "timing":
+            if not isinstance(value, dict):
+                raise UsageError(f"scenario {path}: 'timing' must be a table")
+            values[key] = timing_from(value, f"scenario {path}, [timing]")
         elif key in ("title", "duration_s"):
             values[key] = _typed(value, str if key == "title" else float, f"scenario {path}: {key}")
         elif key == "faults":
@@ -159,7 +169,7 @@ def _build(tree: dict, name: str, path: Path, raw: bytes) -> Scenario:
                 raise UsageError(f"scenario {path}: faults must be a list of texts such as 'offset:-20@430-550'")
             values[key] = tuple(value)
         else:
-            known = ", ".join(("title", "duration_s", "faults", *tables))
+            known = ", ".join(("title", "duration_s", "faults", "timing", *tables))
             raise UsageError(f"scenario {path}: unknown key '{key}' (known: {known})")
     return Scenario(**values)
 
@@ -169,7 +179,7 @@ def _table(cls, values: dict, where: str):
     for key in values:
         if key not in known:
             raise UsageError(f"{where}: unknown key '{key}' (known: {', '.join(known)})")
-    texts = ("kind", "path", "setting", "name")
+    texts = ("kind", "path", "setting", "name", "trigger")
     return cls(**{k: _typed(v, str if k in texts else float, f"{where} {k}") for k, v in values.items()})
 
 
@@ -209,6 +219,7 @@ def _check(s: Scenario) -> None:
     if not (0 <= s.sensor.variance < math.inf and 0 <= s.sensor.delay_s <= 10 and abs(s.sensor.offset_degc) <= 100):
         refuse("[sensor] needs variance >= 0, delay_s in 0 … 10, |offset_degc| <= 100")
     check_period(s.estimator.period_s, f"scenario {s.path}: [estimator] period_s")
+    check_timing(s.timing, s.estimator.period_s, s.estimator.trigger, f"scenario {s.path}: [timing]")
     check_controller(s, f"scenario {s.path}: [controller]")
     if not (0 < s.limits.miss_rate_max < 1):
         refuse("[limits] miss_rate_max must lie between 0 and 1")

@@ -82,15 +82,16 @@ class Finding:
     evidence: str
 
 
-def judge_misses(misses: int, by_machine: int, releases: int, limit: float) -> Finding:
+def judge_misses(misses: int, by_machine: int, releases: int, limit: float, machine: str = "") -> Finding:
     """Judge a miss rate against ``limit`` by its bounds, never by the bare count.
 
     Parameters
     ----------
     misses : late plus skipped activations
-    by_machine : those of them whose cause is the machine (woken late, preempted), not our code
+    by_machine : those of them whose cause is the machine (woken late, preempted, stolen), not our code
     releases : activations released, executed or not
     limit : allowed miss rate, 0 < limit < 1
+    machine : what was measured of the machine meanwhile; printed where it decides
     """
     lower, upper = miss_rate_bounds(misses, releases)
     says = f"{misses} misses in {releases} releases: rate < {upper:.2%} at {CONFIDENCE:.0%} (limit {limit:.2%})"
@@ -105,7 +106,8 @@ def judge_misses(misses: int, by_machine: int, releases: int, limit: float) -> F
         return Finding(
             "miss rate",
             "inconclusive",
-            f"{says}; {by_machine} of them were woken late or preempted: the machine was taken from us",
+            f"{says}; {by_machine} of them were woken late, preempted or stolen: the machine was taken from us"
+            + (f" ({machine})" if machine else ""),
         )
     return Finding("miss rate", "fail", f"{says}; proven above it, rate > {lower:.2%}")
 

@@ -21,6 +21,7 @@ from rt_runner.mcap_log import LogError, LogWriter
 from rt_runner.provenance import Provenance
 from rt_runner.records import CONTROL_ID, END, TICK, Record, control, pack, read_until_control
 from rt_runner.result import ResultAccumulator, RunFacts
+from rt_runner.timing_config import timing_options
 
 PROGRESS_NS = 1_000_000_000
 
@@ -98,6 +99,7 @@ def run_lockstep(
     plant_command += ["--obey"] if c.present else []
     estimator_command = [str(paths.binary("rt_estimator")), "--lockstep", "--no-rt", "--setting", e.setting]
     estimator_command += ["--period-us", str(round(e.period_s * 1e6))]
+    estimator_command += timing_options(scenario.timing, e.period_s, e.trigger, lockstep=True)
     facts = RunFacts(
         bus="lockstep",
         scenario=scenario.name,
@@ -106,6 +108,7 @@ def run_lockstep(
         seed=seed,
         limits=scenario.limits,
         faults=scenario.all_faults,
+        mk=scenario.timing.mk,
     )
     accumulator = ResultAccumulator()
     peers: list[_Peer] = []
@@ -126,6 +129,8 @@ def run_lockstep(
         with LogWriter(log, dbc, provenance.run, attachments) as writer:
             try:
                 _shuttle(first, plant, [estimator, *others], writer, accumulator, progress)
+                for peer in (estimator, *others):
+                    _keep_final(peer, writer)
             except LogError:
                 raise
             except RtError as error:
@@ -136,6 +141,13 @@ def run_lockstep(
             result = accumulator.result(facts)
             writer.seal(asdict(facts), result)
     return result
+
+
+def _keep_final(peer: _Peer, writer: LogWriter) -> None:
+    """Attach the last line of a process that has ended."""
+    final = next((line for line in peer.json_lines() if "final" in line), None)
+    if final is not None:
+        writer.attach(f"{peer.name}_final.json", json.dumps(final).encode())
 
 
 def _shuttle(

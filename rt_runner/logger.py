@@ -2,7 +2,8 @@
 
 Speaks JSON lines. Out: ``{"ready": true}`` once it receives, ``{"progress": {...}}`` about once a second,
 ``{"error": "..."}`` when bus or disk are lost, at the end ``{"result": {...}}``. In:
-``{"finish": {"outcome": {...}, "granted": {...}}}`` (``outcome`` as `rt_runner.result.RunFacts`).
+``{"finish": {"outcome": {...}, "granted": {...}, "texts": {...}}}`` (``outcome`` as `rt_runner.result.RunFacts`,
+``texts`` are attached to the log: name -> text).
 SIGTERM, SIGINT and the end of standard input finish the file as well: whatever happens, the log is readable.
 """
 
@@ -146,6 +147,8 @@ class Logger:
         self._drain()
         facts = self._facts(finish)
         result = self._accumulator.result(facts)
+        for name, text in (finish.get("finish", {}).get("texts") or {}).items():
+            self._writer.attach(name, text.encode())
         self._writer.seal(asdict(facts), result)
         return result
 

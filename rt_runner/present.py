@@ -132,6 +132,7 @@ def summary(result: dict, log: Path | None) -> str:
                 + ", ".join(f"{k} {'n/a' if q[k] is None else format(q[k], '.1f')}" for k in ("p50", "p99", "max"))
                 + " us"
             )
+    lines += timing_lines(t)
     g = result["granted"]
     if g["policy"] is not None:
         lines.append(
@@ -145,6 +146,15 @@ def summary(result: dict, log: Path | None) -> str:
         lines.append(f"{f['verdict']:<12} {f['what']}: {f['evidence']}")
     lines.append(f"verdict: {result['verdict']}")
     return "\n".join(lines)
+
+
+def timing_lines(t: dict) -> list[str]:
+    """What the policy did and late jobs put out, where there was anything; none for an older log."""
+    shown = [f"{t[key]} {word}" for key, word in (("overrun", "overruns"), ("queued", "ran queued"), ("cut", "cut"),
+                                                  ("rebased", "times the grid moved"), ("held", "outputs held"),
+                                                  ("predicted", "predicted"), ("invalidated", "declared invalid"))
+             if t.get(key)]  # fmt: skip
+    return [f"{'policy':<10} {', '.join(shown)}"] if shown else []
 
 
 def sensor_lines(result: dict) -> list[str]:

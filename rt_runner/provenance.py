@@ -69,6 +69,8 @@ def gather(scenario: Scenario, bus: str, seed: int, identity: dict) -> Provenanc
         "duration_s": repr(scenario.duration_s),
         "setting": scenario.estimator.setting,
         "period_s": repr(scenario.estimator.period_s),
+        "trigger": scenario.estimator.trigger,
+        "policy": scenario.timing.policy,
         "faults": ", ".join(scenario.all_faults),
         "scenario_sha256": scenario.sha256,
         **{name: str(identity.get(name, "")) for name in HASHES},

@@ -8,18 +8,32 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass, field, fields, replace
 
-from rt_runner.judge import Finding, judge_misses, overall, percentile
+from rt_runner.judge import Finding, judge_misses, overall
 from rt_runner.sensor_account import SensorAccount
+from rt_runner.timing_account import CAUSES as CAUSES
+from rt_runner.timing_account import MACHINE_CAUSES as MACHINE_CAUSES
+from rt_runner.timing_account import RELEASE_BITS as RELEASE_BITS
+from rt_runner.timing_account import TimingAccount
+from rt_runner.timing_account import Unwrapper as Unwrapper
 
 TICK_S = 0.01
 TICK_BITS = 16
-RELEASE_BITS = 24
 RELEASES_LAST, SKIPPED_LAST = (1 << 24) - 2, (1 << 16) - 2  # counters stop at their last valid code
 SETTLE_S = 10.0  # accuracy is judged from here after the first estimate: the net's memory starts empty
 REPEATED, WRONG_CRC = 1, 4  # E2E states as in the log
 STATUS_SHOWN = ("init", "starting", "ok", "predicting", "input_stale", "invalid", "open_loop", "fallback")
-CAUSES = ("none", "late_wake", "preempted", "long_compute", "stale_input", "blocked_send", "steal")
-MACHINE_CAUSES = ("late_wake", "preempted", "steal")
+# What only the loop's own counters say; null where an older log has them not.
+OWN_COUNTS = {
+    "EstMisses": ("overrun",),
+    "EstOverload": ("queued", "cut", "rebased"),
+    "EstMissRun": ("consec_miss_max", "mk_worst"),
+    "EstOutputs": ("held", "predicted", "invalidated"),
+}
+ENVIRONMENT = {
+    "EstEnvironment": ("minor_faults", "major_faults", "invol_switches"),
+    "EstMachine": ("run_delay_ms", "migrations"),
+    "EstCanary": ("canary_p99_us", "canary_max_us"),
+}
 CORE_FAULTS = {
     "EstCoreFaults": ("restarts", "held_intervals", "late_measurements", "stray_ticks"),
     "EstCoreFaults2": ("off_grid", "invalid_inputs", "unconverged", "repeated_ticks"),
@@ -44,7 +58,7 @@ class RunFacts:
     duration_s: float | None = None
     period_s: float = 0.1
     lockstep: bool = False
-    stopped_by: str = "end"  # end | interrupt | crash
+    stopped_by: str = "end"  # end | interrupt | misses | crash
     crash: str | None = None  # which process, its exit, its last words
     seed: int | None = None
     granted: dict = field(default_factory=dict)
@@ -53,6 +67,7 @@ class RunFacts:
     log_dropped: int = 0  # frames the kernel or the hub dropped before the logger saw them
     log_cut_short: bool = False  # the logger could not take all that had arrived
     faults: tuple[str, ...] = ()  # of the sensors, as text
+    mk: tuple[int, int] | None = None  # at most m misses in any K releases
     restarts: tuple[str, ...] = ()  # how processes ended that were then started again
 
     @staticmethod
@@ -64,24 +79,9 @@ class RunFacts:
             names = {f.name for f in fields(Limits)}
             kept["limits"] = Limits(**{k: v for k, v in kept["limits"].items() if k in names})
         kept["faults"] = tuple(kept.get("faults") or ())
+        kept["mk"] = tuple(kept["mk"]) if kept.get("mk") else None
         kept["restarts"] = tuple(kept.get("restarts") or ())
         return RunFacts(**kept)
-
-
-class Unwrapper:
-    """Turns a counter that wraps at ``2**bits`` back into one that grows (or steps back a little)."""
-
-    def __init__(self, bits: int) -> None:
-        self._modulus = 1 << bits
-        self._last: int | None = None
-
-    def __call__(self, wrapped: float) -> int:
-        value = int(wrapped)
-        if self._last is not None:
-            half = self._modulus // 2
-            value = self._last + (value - self._last + half) % self._modulus - half
-        self._last = value
-        return value
 
 
 @dataclass
@@ -106,22 +106,12 @@ class ResultAccumulator:
         self._truth, self._sensor, self._estimate = _Trace(), _Trace(), _Trace()
         self._sensors = SensorAccount()
         self._first_estimate_tick: int | None = None
-        self._release = Unwrapper(RELEASE_BITS)
-        self._releases: list[int] = []
-        self._late = self._warmup_jobs = self._warmup_misses = self._stale_jobs = 0
-        self._causes: dict[str, int] = dict.fromkeys(CAUSES, 0)
-        self._judged_causes: dict[str, int] = dict.fromkeys(CAUSES, 0)
-        self._skipped = 0
-        self._in_warmup = self._was_late = False
-        self._wake_us: list[float] = []
-        self._exec_us: list[float] = []
-        self._resp_us: list[float] = []
+        self._timing = TimingAccount()
         self._last: dict[str, dict[str, float | None]] = {}
         self._counter: dict[str, int] = {}
         self._frames = self._lost = self._damaged = 0
         self._first_ns: int | None = None
         self._last_ns = 0
-        self._last_cause = "none"
 
     def feed(self, t_ns: int, name: str, values: dict[str, float | None], e2e: int = 0) -> None:
         """Take one decoded frame.
@@ -247,41 +237,23 @@ class ResultAccumulator:
 
     # ---- timing ---------------------------------------------------------------------------------------
     def _on_EstTimingA(self, v: dict) -> None:
-        if v.get("release_index") is None:
-            return
-        release = self._release(v["release_index"])
-        warmup, late = bool(v.get("warmup")), bool(v.get("miss_late"))
-        skipped = 0
-        if v.get("after_skip") and self._releases:  # without the flag a gap is a frame lost on the way to the log
-            skipped = max(0, release - self._releases[-1] - 1)
-            self._skipped += skipped
-            self._causes[self._last_cause] += skipped
-            if not warmup:
-                self._judged_causes[self._last_cause] += skipped
-        self._releases.append(release)
-        self._late += late
-        self._was_late = late
-        self._stale_jobs += bool(v.get("stale_input"))
-        self._in_warmup = warmup
-        self._warmup_jobs += warmup
-        self._warmup_misses += (late + skipped) if warmup else 0
-        if not warmup and v.get("wake_lat_us") is not None:
-            self._wake_us.append(v["wake_lat_us"])
+        self._timing.job_a(v)
 
     def _on_EstTimingB(self, v: dict) -> None:
-        cause = v.get("miss_cause")
-        self._last_cause = CAUSES[int(cause)] if cause is not None and int(cause) < len(CAUSES) else "none"
-        self._causes[self._last_cause] += self._was_late  # a job in time may name a cause (stale input), too
-        if self._in_warmup:
-            return
-        self._judged_causes[self._last_cause] += self._was_late
-        for key, into in (("exec_wall_us", self._exec_us), ("resp_us", self._resp_us)):
-            if v.get(key) is not None:
-                into.append(v[key])
+        self._timing.job_b(v)
+
+    def _on_EstTimingC(self, v: dict) -> None:
+        self._timing.job_c(v)
+
+    def _on_EstTimingD(self, v: dict) -> None:
+        self._timing.job_d(v)
 
     def _count(self, message: str, signal: str) -> int:
         value = self._last.get(message, {}).get(signal)
         return 0 if value is None else int(value)
+
+    def _value(self, message: str, signal: str) -> float | None:
+        return self._last.get(message, {}).get(signal)
 
     # ---- the result -----------------------------------------------------------------------------------
     def result(self, facts: RunFacts) -> dict:
@@ -301,7 +273,6 @@ class ResultAccumulator:
             *self._judge_timing(facts, dropped),
             self._judge_log(dropped, facts.log_cut_short),
         ]
-        jobs = len(self._releases)
         return {
             "verdict": overall(findings),
             "findings": [vars(f) for f in findings],
@@ -315,22 +286,19 @@ class ResultAccumulator:
             "timing": {
                 "estimator": {
                     "period_s": facts.period_s,
-                    "jobs": jobs,
-                    "releases": jobs + self._skipped,
-                    "warmup_jobs": self._warmup_jobs,
-                    "miss_late": self._late,
-                    "miss_skipped": self._skipped,
-                    "stale_jobs": self._stale_jobs,
-                    "causes": {
-                        k: n for k, n in self._causes.items() if n
-                    },
-                    "wake_lat_us": _quantiles(self._wake_us),
-                    "exec_wall_us": _quantiles(self._exec_us),
-                    "resp_us": _quantiles(self._resp_us),
+                    **self._timing.figures(),
+                    **{k: _whole(self._value(m, k)) for m, ks in OWN_COUNTS.items() for k in ks},
+                    "phase_us": self._value("EstMissRun", "phase_us"),
+                    "mk": None if facts.mk is None else {"m": facts.mk[0], "k": facts.mk[1],
+                                                         "worst": self._timing.worst_of(facts.mk[1])},
                 }
             },
             "granted": {k: facts.granted.get(k) for k in ("policy", "core", "mlock")},
-            "environment": {"steal_ms": facts.steal_ms, "warnings": facts.granted.get("warnings", [])},
+            "environment": {
+                "steal_ms": facts.steal_ms,
+                "warnings": facts.granted.get("warnings", []),
+                **{k: self._value(m, k) for m, ks in ENVIRONMENT.items() for k in ks},
+            },
             "input_faults": {k: self._count("EstInputFaults", k) for k in ("crc_errors", "seq_errors", "stale_inputs")},
             "bus_faults": {k: self._count("EstBusFaults", k) for k in ("rx_drops", "tx_drops", "rejected")},
             "core_faults": {k: self._count(m, k) for m, ks in CORE_FAULTS.items() for k in ks},
@@ -346,6 +314,9 @@ class ResultAccumulator:
             return [Finding("run", "fail", facts.crash)]
         if facts.restarts:
             return [Finding("run", "fail", f"{words}; it was started again") for words in facts.restarts]
+        if facts.stopped_by == "misses":
+            says = "the estimator stopped itself: the number of misses in its policy was reached"
+            return [Finding("policy", "fail", says)]
         if facts.stopped_by == "interrupt":
             return [Finding("run", "inconclusive", "stopped by hand before its end")]
         return []
@@ -371,16 +342,15 @@ class ResultAccumulator:
         return out
 
     def _judge_timing(self, facts: RunFacts, dropped: int) -> list[Finding]:
-        jobs = len(self._releases)
-        out = []
+        jobs, out = self._timing.jobs, []
         if not facts.lockstep:
-            misses = self._late + self._skipped - self._warmup_misses
-            by_machine = min(misses, sum(self._judged_causes[c] for c in MACHINE_CAUSES))
-            releases = max(jobs + self._skipped - self._warmup_jobs, 0)
-            finding = judge_misses(min(misses, releases), by_machine, releases, facts.limits.miss_rate_max)
+            judged = self._timing.judged()
+            limit = facts.limits.miss_rate_max
+            finding = judge_misses(judged.misses, judged.by_machine, judged.releases, limit, self._machine(facts))
             if finding.verdict == "fail" and dropped:
                 finding = replace(finding, verdict="inconclusive", evidence=f"{finding.evidence}; but the log has gaps")
             out.append(finding)
+            out += [self._timing.judge_mk(facts.mk, dropped)] if facts.mk else []
         own_releases, own_jobs = self._count("EstReleases", "releases"), self._count("EstReleases", "jobs")
         own_skipped = self._count("EstMisses", "miss_skipped")
         if not own_releases or own_releases >= RELEASES_LAST or own_skipped >= SKIPPED_LAST:
@@ -394,8 +364,21 @@ class ResultAccumulator:
             out.append(Finding("conservation", "inconclusive", says))
         else:
             says = f"{own_releases} releases = {own_jobs} jobs + {own_skipped} skipped"
+            waiting = self._count("EstOverload", "waiting")
+            says += f" (and {waiting} wait)" if waiting else ""
             out.append(Finding("conservation", "pass", says))
         return out
+
+    def _machine(self, facts: RunFacts) -> str:
+        """What speaks for the machine having been taken from us, in words; empty where nothing was measured."""
+        shown = []
+        p99, largest = (self._value("EstCanary", k) for k in ("canary_p99_us", "canary_max_us"))
+        if largest is not None:
+            shown.append(f"canary up to {largest:.0f} us late" + (f" (p99 {p99:.0f} us)" if p99 is not None else ""))
+        shown += [f"{facts.steal_ms:.0f} ms stolen"] if facts.steal_ms is not None else []
+        delay = self._value("EstMachine", "run_delay_ms")
+        shown += [f"{delay:.1f} ms ready but not run"] if delay is not None else []
+        return ", ".join(shown)
 
     def _judge_log(self, dropped: int, cut_short: bool) -> Finding:
         trouble = [f"{dropped} frames missing"] if dropped else []
@@ -406,10 +389,10 @@ class ResultAccumulator:
         return Finding("log", "pass", f"{self._frames} frames, none missing by their counters")
 
 
+def _whole(count: float | None) -> int | None:
+    return None if count is None else int(count)
+
+
 def _rms(errors: list[float]) -> float | None:
     return math.sqrt(sum(e * e for e in errors) / len(errors)) if errors else None
 
-
-def _quantiles(samples: list[float]) -> dict[str, float | None]:
-    ordered = sorted(round(x, 1) for x in samples)  # the bus's resolution: 0.1 us
-    return {"p50": percentile(ordered, 50), "p99": percentile(ordered, 99), "max": ordered[-1] if ordered else None}

@@ -17,10 +17,12 @@ from rt_runner.controller import controller_command, preview
 from rt_runner.errors import RtError, SetupError
 from rt_runner.provenance import Provenance
 from rt_runner.result import RunFacts
+from rt_runner.timing_config import timing_options
 
 LOGGER_READY_S = 30.0
 READY_S = 90.0  # the plant compiles its kernel at first use and drives to the scenario's start
 ESTIMATOR_DRAIN_S = 0.25
+STOPPED_BY_MISSES = 2  # how the estimator ends when its policy stops it
 RESTARTS_MAX = 3  # of one process, where a controller closes the loop; without one, a process that ends fails the run
 
 
@@ -57,6 +59,7 @@ class Supervisor:
         self._children: list[Child] = []
         self._workers: dict[str, Child] = {}
         self._restarts: list[str] = []
+        self._finals: dict[str, dict] = {}  # the last line of estimator and controller
         self._road = Path()
 
     def stop(self) -> None:
@@ -117,6 +120,7 @@ class Supervisor:
             seed=plan.seed,
             limits=scenario.limits,
             faults=scenario.all_faults,
+            mk=scenario.timing.mk,
         )
 
     def _plant_command(self, bus: str) -> list[str]:
@@ -142,8 +146,9 @@ class Supervisor:
             self._watch(plant, bus, logger)
             if not self._stopped:
                 time.sleep(ESTIMATOR_DRAIN_S)  # the last interval is estimated, too
-            for worker in self._workers.values():
+            for name, worker in self._workers.items():
                 self._end(worker)  # first: a job after the last frame would only find stale inputs
+                self._keep_final(name)
             self._end(plant)
         except ChildError as e:
             if not self._stopped:
@@ -155,7 +160,7 @@ class Supervisor:
             facts,
             duration_s=time.monotonic() - began,
             crash=crash,
-            stopped_by="crash" if crash else "interrupt" if self._stopped else "end",
+            stopped_by="crash" if crash else "interrupt" if self._stopped else self._ended_by(),
             steal_ms=None if steal_0 is None or steal_1 is None else steal_1 - steal_0,
             restarts=tuple(self._restarts),
         )
@@ -199,6 +204,7 @@ class Supervisor:
             str(round(e.period_s * 1e6)),
             "--core",
             str(self._core),
+            *timing_options(self._plan.scenario.timing, e.period_s, e.trigger),
         ]
         return command if self._plan.realtime else [*command, "--no-rt"]
 
@@ -210,6 +216,8 @@ class Supervisor:
             if logger.ended():
                 raise ChildError(logger.obituary())
             for name in [name for name, worker in self._workers.items() if worker.ended()]:
+                if self._stopped_itself(name):
+                    return
                 self._restart(name, bus)
             self._drain(logger)
             time.sleep(0.05)
@@ -235,14 +243,33 @@ class Supervisor:
             elif "error" in line:
                 raise ChildError(f"the logger: {line['error']}")
 
+    def _stopped_itself(self, name: str) -> bool:
+        """Whether this process ended as its policy says, after too many misses: no crash, but the end of the run."""
+        if self._workers[name].reap(1.0) != STOPPED_BY_MISSES:
+            return False
+        self._keep_final(name)
+        return self._finals.get(name, {}).get("stopped_by") == "misses"
+
+    def _keep_final(self, name: str) -> None:
+        """Take the last line of a process that has ended."""
+        lines = self._workers[name].lines
+        while not lines.empty():
+            line = lines.get()
+            if line is not None and "final" in line:
+                self._finals[name] = line
+
+    def _ended_by(self) -> str:
+        return "misses" if any(f.get("stopped_by") == "misses" for f in self._finals.values()) else "end"
+
     def _end(self, child: Child) -> None:
         status = child.stop()
-        if status not in (0, -15):
+        if status not in (0, -15) and not (status == STOPPED_BY_MISSES and child in self._workers.values()):
             raise ChildError(child.obituary())
 
     def _finish(self, logger: Child, facts: RunFacts) -> dict:
         """Hand the facts to the logger, which knows every frame; it closes the log and answers with the result."""
-        logger.tell(json.dumps({"finish": {"outcome": asdict(facts), "granted": facts.granted}}))
+        texts = {f"{name}_final.json": json.dumps(line) for name, line in self._finals.items()}
+        logger.tell(json.dumps({"finish": {"outcome": asdict(facts), "granted": facts.granted, "texts": texts}}))
         try:
             result = logger.wait_line("result", 60.0)["result"]
         except ChildError as e:

@@ -25,8 +25,10 @@ def run(args) -> int:
     from rt_runner.lockstep import run_lockstep
     from rt_runner.mcap_log import prepare_log_path
     from rt_runner.present import Progress, check_json_path, deliver
+    from rt_runner.timing_config import timing_options
 
     scenario, dbc = scenario_from(args), load_dbc()
+    timing_options(scenario.timing, scenario.estimator.period_s, scenario.estimator.trigger, lockstep=True)
     check_json_path(args.json, args.log)
     identity = provenance.preflight(scenario, dbc)
     log = prepare_log_path(Path(args.log) if args.log else None, f"{scenario.name}-mil")

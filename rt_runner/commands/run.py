@@ -57,6 +57,7 @@ def scenario_from(args):
 
     from rt_runner.config import check_controller, check_faults, check_period, load_scenario, with_duration, with_faults
     from rt_runner.errors import UsageError
+    from rt_runner.timing_config import check_timing
 
     s = with_faults(with_duration(load_scenario(args.scenario), args.duration), args.fault)
     check_faults(s)
@@ -65,6 +66,7 @@ def scenario_from(args):
     if args.period is not None:
         check_period(args.period, "--period")
         s = replace(s, estimator=replace(s.estimator, period_s=args.period))
+        check_timing(s.timing, args.period, s.estimator.trigger, "--period: [timing]")
     if args.controller is not None:
         s = replace(s, controller=replace(s.controller, name=args.controller))
         check_controller(s, "--controller")
