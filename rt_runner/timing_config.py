@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import dataclass
+from typing import Any
 
 from rt_runner.errors import UsageError
 
@@ -54,7 +55,7 @@ def timing_from(values: dict, where: str) -> TimingConfig:
         fits, shape = shapes[key]
         if not fits(value):
             raise UsageError(f"{where} {key} = {value!r}: must be {shape}")
-    taken = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+    taken: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
     if "grace_s" in taken:
         taken["grace_s"] = float(taken["grace_s"])
     return TimingConfig(**taken)
