@@ -84,6 +84,13 @@ def analyse(path: str | Path) -> TimingReport:
     findings = [*(f for t in timings for f in t.findings), _log_finding(reader, setup)]
     if setup.facts.crash:
         findings.append(Finding("run", "fail", setup.facts.crash))
+    findings += [
+        Finding(
+            f"{t.process.name} life", "fail", f"it ended after release {max(t.jobs.release, default=0)}, without a word"
+        )
+        for t in timings
+        if t.process.life
+    ]
     return TimingReport(
         path=str(path),
         setup=setup,

@@ -276,5 +276,6 @@ def test_a_process_that_was_started_again_has_two_lives(whole, tmp_path):
     assert [p.process.name for p in report.processes] == ["estimator_1", "estimator"]
     assert [len(p.jobs) for p in report.processes] == [37, len(script())]
     assert [p.audit.ok for p in report.processes] == [True, True], [p.audit.failed for p in report.processes]
+    assert [(f.what, f.verdict) for f in report.findings if "life" in f.what] == [("estimator_1 life", "fail")]
     assert [p.audit.ok for p in written("b.mcap", (0, 100)).processes] == [False, True]
     assert [p.audit.ok for p in written("c.mcap", (1, 100)).processes] == [True, False]
