@@ -39,8 +39,8 @@ class Expected:
 class CycleRow:
     """One message over one log. Times between neighbouring frames in ms, None where there are too few frames.
 
-    ``typical_ms`` is the mean without the shortest and the longest period, of fewer than five periods the longest: last
-    words at the end of a run and one interruption do not change a rate. ``longest_ms`` counts the silences at both
+    ``typical_ms`` is the mean without the shortest and the longest period, of fewer than five periods their upper median:
+    last words at the end of a run and one interruption do not change a rate. ``longest_ms`` counts the silences at both
     ends, too: from its node's first frame on, and up to its node's last one, or the log's end less a second.
     ``longest_from_ns`` is the stamp it began at. ``missing`` is how many cycles passed without a frame, ``timeouts``
     how often it was silent for longer than ``timeout_ms``; a message that never came although its node spoke for long
@@ -167,7 +167,7 @@ class _Meter:
     """Running figures of one message."""
 
     __slots__ = (
-        "_cycle_ns", "_m2", "_mean", "_timeout_ns", "expected", "first_ns", "frames", "last_ns", "longest_from_ns",
+        "_cycle_ns", "_early", "_m2", "_mean", "_timeout_ns", "expected", "first_ns", "frames", "last_ns", "longest_from_ns",
         "longest_ns", "max_ns", "min_ns", "missing", "timeouts",
     )  # fmt: skip
 
@@ -179,6 +179,7 @@ class _Meter:
         self.first_ns = self.last_ns = self.min_ns = self.max_ns = 0
         self.longest_ns, self.longest_from_ns = -1, 0
         self._mean = self._m2 = 0.0
+        self._early: list[int] = []  # the first periods, until there are enough for a mean
 
     def add(self, t_ns: int) -> None:
         n = self.frames
@@ -192,6 +193,8 @@ class _Meter:
             self.min_ns = period
         if n == 1 or period > self.max_ns:
             self.max_ns = period
+        if n < TRIM_FROM:
+            self._early.append(period)
         delta = period - self._mean
         self._mean += delta / n
         self._m2 += delta * (period - self._mean)
@@ -216,7 +219,7 @@ class _Meter:
                     longest_ns, from_ns = silent_ns, start_ns
         e, periods = self.expected, self.frames - 1
         mean_ns = (self.last_ns - self.first_ns) / periods if periods > 0 else None
-        typical_ns = self.max_ns if periods > 0 else None
+        typical_ns = sorted(self._early)[len(self._early) // 2] if periods > 0 else None
         if periods >= TRIM_FROM:
             typical_ns = (self.last_ns - self.first_ns - self.min_ns - self.max_ns) / (periods - 2)
         return CycleRow(

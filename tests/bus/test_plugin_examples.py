@@ -15,6 +15,7 @@ from tests.support.buses import have_vcan
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "bus_timing"
 DOCUMENT = ROOT / "docs" / "pytest-plugin.md"
+TRIES = 3  # real time on a machine that others use: a freeze of half a second fails one try, a fault of ours all
 BLOCK = re.compile(r"```python\n# (test_\w+\.py)\n(.*?)```", re.DOTALL)
 
 
@@ -42,10 +43,13 @@ def test_the_example_passes(bus, tmp_path):
     for name, text in BLOCK.findall(DOCUMENT.read_text()):
         (tmp_path / name).write_text(text)
     plugin = [] if any(e.name == "rt_runner" for e in entry_points(group="pytest11")) else ["-prt_runner.pytest_plugin"]
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *plugin, f"--rt-bus={bus}", tmp_path],
-        cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
+    for _ in range(TRIES):
+        done = subprocess.run(
+            [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *plugin, f"--rt-bus={bus}", tmp_path],
+            cwd=tmp_path, capture_output=True, text=True, timeout=180, check=False,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+        if done.returncode == 0:
+            break
     assert done.returncode == 0, done.stdout + done.stderr
     assert "3 passed" in done.stdout, "nothing is skipped"
