@@ -39,7 +39,7 @@ class Expected:
 class CycleRow:
     """One message over one log. Times between neighbouring frames in ms, None where there are too few frames.
 
-    ``typical_ms`` is the mean without the shortest and the longest period, of fewer than five periods their upper median:
+    ``typical_ms`` is the mean without the shortest and the longest period, of fewer than five periods the upper median:
     last words at the end of a run and one interruption do not change a rate. ``longest_ms`` counts the silences at both
     ends, too: from its node's first frame on, and up to its node's last one, or the log's end less a second.
     ``longest_from_ns`` is the stamp it began at. ``missing`` is how many cycles passed without a frame, ``timeouts``
