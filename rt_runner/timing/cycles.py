@@ -167,8 +167,8 @@ class _Meter:
     """Running figures of one message."""
 
     __slots__ = (
-        "_cycle_ns", "_early", "_m2", "_mean", "_timeout_ns", "expected", "first_ns", "frames", "last_ns", "longest_from_ns",
-        "longest_ns", "max_ns", "min_ns", "missing", "timeouts",
+        "_cycle_ns", "_early", "_m2", "_mean", "_timeout_ns", "expected", "first_ns", "frames", "last_ns",
+        "longest_from_ns", "longest_ns", "max_ns", "min_ns", "missing", "timeouts",
     )  # fmt: skip
 
     def __init__(self, expected: Expected) -> None:
