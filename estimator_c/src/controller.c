@@ -8,7 +8,7 @@ enum { TICKS_PER_STEP = 10, PLAN_LIFE_STEPS = 5, SPIN_UP_STEPS = 5 };
 
 static const double TICK_S = 0.01;
 static const double LOW_DEGC = -60.0, HIGH_DEGC = 250.0; /* no temperature of a machine lies beyond */
-static const double FRESH_S = 0.3;           /* an estimate older than that is made up by the net */
+enum { FRESH_TICKS = 30 };                    /* an estimate older than that is made up by the net */
 static const double DOUBT_K_PER_S = 0.05, DOUBT_MAX_K = 10.0;
 static const double SLACK_JUMP_K = 2.0;
 static const double CLAMP_DEGC = 157.0;
@@ -106,7 +106,8 @@ void controller_feed_estimate(controller_t *self, double theta_w_degc, double th
     if (!usable) {
         return;
     }
-    const bool good = theta_w_degc > LOW_DEGC && theta_w_degc < HIGH_DEGC && theta_r_degc > LOW_DEGC && theta_r_degc < HIGH_DEGC;
+    const bool good = theta_w_degc > LOW_DEGC && theta_w_degc < HIGH_DEGC && theta_r_degc > LOW_DEGC &&
+        theta_r_degc < HIGH_DEGC;
     if (!good) { /* a NaN too */
         self->counters.bad_inputs++;
         return;
@@ -177,8 +178,8 @@ static void advance_net(controller_t *self)
 
 static double doubt(const controller_t *self)
 {
-    const double age_s = TICK_S * self->ticks * self->estimate_age;
-    return self->estimate_age < 0 || age_s <= FRESH_S ? 0.0 : fmin(DOUBT_MAX_K, DOUBT_K_PER_S * age_s);
+    const int32_t age = self->ticks * (self->estimate_age < 100000 ? self->estimate_age : 100000);
+    return self->estimate_age < 0 || age <= FRESH_TICKS ? 0.0 : fmin(DOUBT_MAX_K, DOUBT_K_PER_S * TICK_S * age);
 }
 
 /* The last plan, seen from `age` steps later: means over the new intervals. */
@@ -201,8 +202,8 @@ static void shift_plan(const controller_t *self, int32_t age, double to[][2])
     }
 }
 
-/* Drive the road ahead, by the plan or, without one, as a driver without patience would, and note what it asks for; the torques of
- * the latter become the plan. */
+/* Drive the road ahead, by the plan or, without one, as a driver without patience would, and note what it asks for;
+ * the torques of the latter become the plan. */
 static void look_ahead(const controller_t *self, bool planned, double plan[][2], mpc_problem_t *problem)
 {
     const mpc_t *mpc = &self->mpc;
@@ -219,7 +220,8 @@ static void look_ahead(const controller_t *self, bool planned, double plan[][2],
                 torque[0] = within(plan[k][0], -regen, drive);
                 torque[1] = within(plan[k][1], -car->friction_nm, 0.0);
             } else {
-                const double wish = car->kp_nm_per_mps * (on_road(&self->road, self->road.v_ref_mps, x + v * NET_DT_S) - v);
+                const double wish = car->kp_nm_per_mps * (on_road(&self->road, self->road.v_ref_mps,
+                                                                  x + v * NET_DT_S) - v);
                 mpc_envelope(car, v, &drive, &regen);
                 torque[0] = within(wish, -regen, drive);
                 torque[1] = within(wish - torque[0], -car->friction_nm, 0.0);
@@ -284,7 +286,8 @@ static bool solve(controller_t *self, controller_out_t *out)
     out->slack_k = result.slack_k;
     out->predicted_end_degc = result.theta[set->intervals][0];
     out->predicted_peak_degc = self->theta[0];
-    double excess = fmax(fmax(self->theta[0] - problem.limit[0], self->theta[1] - problem.limit[1]), self->last_slack_k);
+    double excess = fmax(fmax(self->theta[0] - problem.limit[0], self->theta[1] - problem.limit[1]),
+                         self->last_slack_k);
     for (int32_t k = 1; k <= set->intervals; k++) {
         out->predicted_peak_degc = fmax(out->predicted_peak_degc, result.theta[k][0]);
     }
@@ -315,7 +318,8 @@ static void drive_by_law(controller_t *self, double share, controller_out_t *out
     double drive, regen;
     mpc_envelope(&mpc_vehicle, self->v_mps, &drive, &regen);
     const double dt_s = TICK_S * self->ticks;
-    const pi_command_t command = pi_driver_step(&self->driver, &mpc_vehicle, self->v_mps, out->v_ref_mps, drive, regen, share, dt_s);
+    const pi_command_t command = pi_driver_step(&self->driver, &mpc_vehicle, self->v_mps, out->v_ref_mps, drive,
+                                                regen, share, dt_s);
     take(out, command.drive_nm + command.regen_nm, command.friction_nm);
     out->derating = command.cut;
 }
@@ -352,7 +356,8 @@ static void drive_by_plan(controller_t *self, bool on_grid, controller_out_t *ou
         take(out, self->command_nm[0], self->command_nm[1]);
     }
     if (out->source == CONTROLLER_BY_RULE) {
-        drive_by_law(self, derating_rule_share(&FALLBACK_RULE, out->theta_w_degc + doubt(self), out->theta_r_degc), out);
+        drive_by_law(self, derating_rule_share(&FALLBACK_RULE, out->theta_w_degc + doubt(self), out->theta_r_degc),
+                     out);
     }
 }
 
@@ -393,7 +398,7 @@ void controller_step(controller_t *self, controller_out_t *out)
     if (on_grid) {
         advance_net(self);
     }
-    out->estimate_fresh = self->estimate_age >= 0 && TICK_S * self->ticks * self->estimate_age <= FRESH_S;
+    out->estimate_fresh = self->estimate_age >= 0 && self->estimate_age <= FRESH_TICKS / self->ticks;
     self->counters.no_estimate += !out->estimate_fresh;
     out->theta_w_degc = self->theta[0];
     out->theta_r_degc = self->theta[1];

@@ -1,16 +1,17 @@
 /* The controller's core: estimate, motion and the road ahead in, torque commands out. It knows no clock, no bus and no
  * file; a step is a step of the period that it was set up with.
  *
- *   feed_estimate, feed_motion, feed_motor ─→ what the winding is at, with how much doubt ─→ MPC │ PI driver (+ linear rule)
- *                                                                                        └─→ clamp, fall-backs ─→ command
+ *   feed_estimate, feed_motion, feed_motor ─→ temperatures, and how much doubt ─→ MPC │ PI driver (+ linear rule)
+ *                                                                             └─→ clamp, fall-backs ─→ command
  *
- * Fall-backs of the MPC, in this order: a solution that failed, is not finite or whose slack jumped by more than 2 K is
- * replaced by the last one, shifted, for at most 0.5 s; after that the PI driver under the linear rule 150 to 155 degC drives.
- * Above 157 degC that rule clamps the driving and the regenerating torque in any case. Without a fresh estimate the net runs on from
- * the last one, and the doubt grows by 0.05 K/s up to 10 K; a controller that never had one commands no motor torque.
+ * Fall-backs of the MPC, in this order: a solution that failed, is not finite or whose slack jumped by more than 2 K
+ * is replaced by the last one, shifted, for at most 0.5 s; after that the PI driver under the linear rule 150 to 155
+ * degC drives. Above 157 degC that rule clamps the driving and the regenerating torque in any case. Without a fresh
+ * estimate the net runs on from the last one, and the doubt grows by 0.05 K/s up to 10 K; a controller that never had
+ * one commands no motor torque.
  *
- * Everything: no allocation, no printing; one thread at a time per object; state sizeof(controller_t), owned by the caller
- * (about 300 kB, most of it the MPC's work space). Torques are at the motor's shaft. */
+ * Everything: no allocation, no printing; one thread at a time per object; state sizeof(controller_t), owned by the
+ * caller (about 300 kB, most of it the MPC's work space). Torques are at the motor's shaft. */
 #ifndef CONTROLLER_H
 #define CONTROLLER_H
 
@@ -32,7 +33,8 @@ typedef enum {
     CONTROLLER_UNKNOWN = 1,     /* no controller of that name */
     CONTROLLER_BAD_PERIOD = 2,  /* not 10 ms times a divisor of 10 */
     CONTROLLER_BAD_ROAD = 3,    /* fewer than two points, a step that is not positive, or a value that is not finite */
-    CONTROLLER_NO_NET = 4,      /* the net compiled in is none that the MPC can differentiate (one layer of LSTM cells) */
+    /* the net compiled in is none that the MPC can differentiate (one layer of LSTM cells) */
+    CONTROLLER_NO_NET = 4,
 } controller_error_t;
 
 /* Who made the command. */
@@ -123,15 +125,17 @@ typedef struct controller {
 /* Set up by name: "none", "rule-150-155", "rule-145-160", or an MPC setting ("mpc-S", "mpc-M", "paper"). period_s: of
  * controller_step(), 0.01, 0.02, 0.05 or 0.1; the MPC solves on every 0.1 s. The road is copied, its tables are not.
  * An error leaves the object unusable. < 50 us plus one look at each point of the road. */
-controller_error_t controller_init(controller_t *self, const char *name, double period_s, const controller_road_t *road);
+controller_error_t controller_init(controller_t *self, const char *name, double period_s,
+                                   const controller_road_t *road);
 
-/* The estimate of now. sigma_w: its standard deviation, upper_w: conservative upper bound (NAN: not known). usable: false for a
- * status that is no estimate (init, starting, invalid). Values that are not finite or outside -60..250 degC count as none.
- * Never fails. < 0.1 us. */
+/* The estimate of now. sigma_w: its standard deviation, upper_w: conservative upper bound (NAN: not known). usable:
+ * false for a status that is no estimate (init, starting, invalid). Values that are not finite or outside -60..250
+ * degC count as none. Never fails. < 0.1 us. */
 void controller_feed_estimate(controller_t *self, double theta_w_degc, double theta_r_degc, double sigma_w_degc,
                               double upper_w_degc, bool usable);
 
-/* Where the car is on the road and how fast. A distance that is not finite is made from the speed. Never fails. < 0.1 us. */
+/* Where the car is on the road and how fast. A distance that is not finite is made from the speed. Never fails. < 0.1
+ * us. */
 void controller_feed_motion(controller_t *self, double x_m, double v_mps);
 
 /* Torque and speed as measured, any number between two steps: their mean goes to the net. Never fails. < 0.1 us. */

@@ -8,7 +8,8 @@ static const double RPM_PER_RAD_S = 30.0 / 3.14159265358979323846;
 static const double ABOVE_V_MAX_MPS = 1.0;
 static const double NEAR_K = 15.0;        /* a temperature this far below its limit does not count in this iteration */
 static const double TORQUE_FLOOR_NM = 15.0; /* of the curvature's divisor */
-static const double SETTLED_NM = 0.3;     /* after a change below that the curvature is not computed anew */
+static const double SETTLED_NM = 0.3;     /* after a change below that the curvature is not computed anew, */
+static const double SETTLED_SHARE = 0.1;  /* unless the multipliers have changed by more than that */
 static const double ARMIJO = 1e-4;
 enum { HALVINGS_MAX = 8 };
 
@@ -50,7 +51,8 @@ void mpc_envelope(const mpc_vehicle_t *vehicle, double v_mps, double *drive_nm, 
 }
 
 /* v one sub-step on; derivative: over v. That over T or F is `by_force()`. */
-static double vehicle_step(const mpc_vehicle_t *car, double v, double force_nm, double sine, double cosine, double *derivative)
+static double vehicle_step(const mpc_vehicle_t *car, double v, double force_nm, double sine, double cosine,
+                           double *derivative)
 {
     const double weight = car->mass_kg * car->gravity_mps2;
     const double length = sqrt(v * v + STANDSTILL_MPS * STANDSTILL_MPS);
@@ -79,7 +81,8 @@ void mpc_init(mpc_t *self, const mpc_setting_t *setting, const mpc_vehicle_t *ve
     self->vehicle = *vehicle;
     self->scale = setting->speed > 0.0 ? setting->speed : 1.0;
     double *const weight[] = {
-        &self->setting.speed, &self->setting.friction, &self->setting.torque, &self->setting.torque_change, &self->setting.slack,
+        &self->setting.speed, &self->setting.friction, &self->setting.torque, &self->setting.torque_change,
+            &self->setting.slack,
         &self->setting.slack_square, &self->setting.above_reference, &self->setting.above_v_max,
     };
     for (size_t k = 0; k < sizeof weight / sizeof weight[0]; k++) {
@@ -101,7 +104,8 @@ void mpc_forget(mpc_t *self)
 }
 
 /* Cost of interval k but for friction and change of torque, with its derivatives over v+ (first and second). */
-static double cost_of_speed(const mpc_t *self, const mpc_problem_t *problem, int k, double v, double *slope, double *curvature)
+static double cost_of_speed(const mpc_t *self, const mpc_problem_t *problem, int k, double v, double *slope,
+                            double *curvature)
 {
     const mpc_setting_t *set = &self->setting;
     const double error = v - problem->v_ref_mps[k];
@@ -171,7 +175,8 @@ static void roll(const mpc_t *self, const mpc_problem_t *problem, bool wished, m
     }
 }
 
-/* Derivatives of speeds and torques, and all of the cost but the temperatures: gradient and Gauss and Newton's matrix. */
+/* Derivatives of speeds and torques, and all of the cost but the temperatures: gradient and Gauss and Newton's matrix.
+ */
 static void linearise_motion(mpc_t *self, const mpc_problem_t *problem, const mpc_course_t *course)
 {
     const mpc_setting_t *set = &self->setting;
@@ -230,7 +235,8 @@ static void linearise_motion(mpc_t *self, const mpc_problem_t *problem, const mp
 }
 
 /* Which temperatures count, in order of their nodes; returns how many. node[r], channel[r]. */
-static int choose_rows(const mpc_t *self, const mpc_problem_t *problem, const mpc_course_t *course, int node[], int channel[])
+static int choose_rows(const mpc_t *self, const mpc_problem_t *problem, const mpc_course_t *course, int node[],
+                       int channel[])
 {
     int rows = 0;
     for (int k = 0; k < self->setting.intervals && rows + 2 <= OCP_ROWS; k++) {
@@ -246,7 +252,8 @@ static int choose_rows(const mpc_t *self, const mpc_problem_t *problem, const mp
 }
 
 /* The temperatures' derivatives: all rows back through the horizon together, a row joining at its node. */
-static void linearise_heat(mpc_t *self, const mpc_problem_t *problem, const mpc_course_t *course, int node[], int channel[])
+static void linearise_heat(mpc_t *self, const mpc_problem_t *problem, const mpc_course_t *course, int node[],
+                           int channel[])
 {
     ocp_qp_t *qp = &self->qp;
     double v_bar[OCP_ROWS];
@@ -289,7 +296,8 @@ static void linearise_heat(mpc_t *self, const mpc_problem_t *problem, const mpc_
     }
 }
 
-/* What the temperatures in force, each times its multiplier, ask of every step; returns the last interval that matters, -1: none. */
+/* What the temperatures in force, each times its multiplier, ask of every step; returns the last interval that
+ * matters, -1: none. */
 static int weigh_back(mpc_t *self, const mpc_course_t *course)
 {
     ocp_row_t all = {.theta = {0.0, 0.0}};
@@ -306,9 +314,9 @@ static int weigh_back(mpc_t *self, const mpc_course_t *course)
     return last;
 }
 
-/* Second derivatives of these temperatures over the torques, each speed held: what the torques do to each other through the net's
- * memory included, what they do through the speed left out. (To take some sub-steps for all does not do: the contributions of
- * neighbours differ in sign.) */
+/* Second derivatives of these temperatures over the torques, each speed held: what the torques do to each other
+ * through the net's memory included, what they do through the speed left out. (To take some sub-steps for all does not
+ * do: the contributions of neighbours differ in sign.) */
 static bool curvature(mpc_t *self, const mpc_course_t *course)
 {
     const int last = weigh_back(self, course);
@@ -318,20 +326,36 @@ static bool curvature(mpc_t *self, const mpc_course_t *course)
     for (int k = 0; k <= last; k++) {
         of_torque[k] = 1.0;
         for (int s = self->first[k]; s < self->first[k + 1]; s++) {
-            ocp_kernel->push(course->tape[s], course->memory[s], &self->bar[s], of_torque, &self->tangent, k + 1, self->curve);
+            ocp_kernel->push(course->tape[s], course->memory[s], &self->bar[s], of_torque, &self->tangent, k + 1,
+                             self->curve);
         }
         of_torque[k] = 0.0;
     }
     return last >= 0;
 }
 
-/* Into the matrix; where that is not positive definite any more, the part that is sure to keep it so: copper loss being square in
- * T, a temperature whose slope over T is a has about the curvature a / T. */
+/* Whether the multipliers are about those of the last curvature. */
+static bool same_forces(const mpc_t *self)
+{
+    double sum = 0.0, change = 0.0;
+    for (int ch = 0; ch < 2; ch++) {
+        for (int k = 0; k < self->setting.intervals; k++) {
+            sum += self->multiplier[ch][k];
+            change += fabs(self->multiplier[ch][k] - self->curve_multiplier[ch][k]);
+        }
+    }
+    return change <= SETTLED_SHARE * sum;
+}
+
+/* Into the matrix; where that is not positive definite any more, the part that is sure to keep it so: copper loss
+ * being square in T, a temperature whose slope over T is a has about the curvature a / T. anew: else that of the
+ * iteration before. */
 static void add_curvature(mpc_t *self, const mpc_course_t *course, const int node[], const int channel[], bool anew)
 {
     ocp_qp_t *qp = &self->qp;
-    if (anew) {
+    if (anew || !same_forces(self)) {
         self->curved = curvature(self, course);
+        memcpy(self->curve_multiplier, self->multiplier, sizeof self->multiplier);
     }
     if (!self->curved) {
         return;
@@ -344,9 +368,8 @@ static void add_curvature(mpc_t *self, const mpc_course_t *course, const int nod
             qp->matrix[2 * i][2 * j] += self->curve[i][j];
         }
     }
-    _Alignas(64) double work[OCP_LD][OCP_LD];
-    memcpy(work, qp->matrix, sizeof work);
-    if (ocp_kernel->factor(work, qp->n)) {
+    memcpy(qp->schur, qp->matrix, sizeof qp->schur);
+    if (ocp_kernel->factor(qp->schur, qp->n)) {
         memcpy(qp->h, qp->matrix, sizeof qp->h);
         return;
     }

@@ -8,14 +8,15 @@
  *                              + Dt sum over both temperatures of rho_1 s + rho_2 s^2,  s = max(theta+ - limit, 0)
  *   -regen(v) <= T <= drive(v),   -friction <= F <= 0,   T and F held over each interval, the envelope at its beginning
  *
- * One motor torque T stands for accelerating and braking torque: with a weight on both, one of them is zero in every solution.
- * The unknowns are tau in T = -regen(v) + tau (drive(v) + regen(v)), 0 <= tau <= 1, and F: a box, so that every iterate
- * keeps to the envelope. v_ref and the slopes are data; who calls makes them from where the car is going to be.
+ * One motor torque T stands for accelerating and braking torque: with a weight on both, one of them is zero in every
+ * solution. The unknowns are tau in T = -regen(v) + tau (drive(v) + regen(v)), 0 <= tau <= 1, and F: a box, so that
+ * every iterate keeps to the envelope. v_ref and the slopes are data; who calls makes them from where the car is going
+ * to be.
  *
- * Each iteration: the horizon forward, exact derivatives of every temperature near its limit by the net's adjoint, a quadratic
- * programme with the slacks eliminated (Mehrotra's predictor and corrector on a dense matrix), a step that the true cost
- * agrees to. The matrix is Gauss and Newton's plus the curvature of the temperatures in force, copper loss being square in T.
- * Its fixed point is the exact KKT point of the problem.
+ * Each iteration: the horizon forward, exact derivatives of every temperature near its limit by the net's adjoint, a
+ * quadratic programme with the slacks eliminated (Mehrotra's predictor and corrector on a dense matrix), a step that
+ * the true cost agrees to. The matrix is Gauss and Newton's plus the curvature of the temperatures in force, copper
+ * loss being square in T. Its fixed point is the exact KKT point of the problem.
  *
  * Everything: no allocation, no clock, no printing; one thread at a time per object; the caller owns it. */
 #ifndef MPC_H
@@ -57,7 +58,8 @@ typedef struct {
     double cost;
     double kkt_nm;                             /* largest change of torque of the last quadratic programme */
     double slack_k;                            /* largest excess of a temperature over its limit */
-    int32_t iterations, qp_iterations, sets, rolls; /* of the quadratic programmes: interior points, active sets; rolls: passes forward through the horizon */
+    /* of the quadratic programmes: interior points, active sets; rolls: passes forward through the horizon */
+    int32_t iterations, qp_iterations, sets, rolls;
 } mpc_result_t;
 
 /* A course through the horizon: unknowns, states, and what their derivatives need. */
@@ -82,6 +84,7 @@ typedef struct {
     double dt_s[MPC_INTERVALS_MAX];
     int32_t first[MPC_INTERVALS_MAX + 1];      /* sub-step at which the interval begins */
     double multiplier[2][MPC_INTERVALS_MAX];
+    double curve_multiplier[2][MPC_INTERVALS_MAX]; /* that the last curvature was weighed with */
     uint8_t kink[2][MPC_INTERVALS_MAX];        /* ocp_kink_t of each temperature in the last quadratic programme */
     mpc_course_t course[2];                    /* present and tried */
     int32_t present;
@@ -101,9 +104,10 @@ typedef struct {
 /* Take a setting and the car; no solution known. 1 us. */
 void mpc_init(mpc_t *self, const mpc_setting_t *setting, const mpc_vehicle_t *vehicle);
 
-/* Solve from the guess in result->torque_nm and friction_nm (clipped to the box). Cost: per iteration about one pass through the
- * horizon forward, one back per temperature near its limit, one quadratic programme; see docs/decisions/mpc.md. MPC_FAILED:
- * the result is not to be used. Forgets nothing but the multipliers of the problem before. */
+/* Solve from the guess in result->torque_nm and friction_nm (clipped to the box). Cost: per iteration about one pass
+ * through the horizon forward, one back per temperature near its limit, one quadratic programme; see
+ * docs/decisions/mpc.md. MPC_FAILED: the result is not to be used. Forgets nothing but the multipliers of the problem
+ * before. */
 mpc_status_t mpc_solve(mpc_t *self, const mpc_problem_t *problem, mpc_result_t *result);
 
 /* The next problem has nothing to do with the last. */

@@ -123,17 +123,21 @@ static void start(ocp_qp_t *self, point_t *at)
 }
 
 /* The step towards complementarity `target`, corrected for the products of `tried` (NULL: none). */
-static void direction(const ocp_qp_t *self, const point_t *at, double target, const point_t *tried, const double residual[],
+static void direction(const ocp_qp_t *self, const point_t *at, double target, const point_t *tried,
+                      const double residual[],
                       point_t *step, double d_step[])
 {
     double of_row[OCP_ROWS], c_t[OCP_ROWS], c_s[OCP_ROWS], c_below[OCP_LD], c_above[OCP_LD];
     for (int k = 0; k < self->n; k++) {
-        c_below[k] = target - at->below[k] * at->z_below[k] - (tried != NULL ? tried->below[k] * tried->z_below[k] : 0.0);
-        c_above[k] = target - at->above[k] * at->z_above[k] - (tried != NULL ? tried->above[k] * tried->z_above[k] : 0.0);
+        c_below[k] = target - at->below[k] * at->z_below[k] -
+                     (tried != NULL ? tried->below[k] * tried->z_below[k] : 0.0);
+        c_above[k] = target - at->above[k] * at->z_above[k] -
+                     (tried != NULL ? tried->above[k] * tried->z_above[k] : 0.0);
         d_step[k] = -residual[k] + c_below[k] / at->below[k] - c_above[k] / at->above[k];
     }
     for (int k = 0; k < self->rows; k++) {
-        c_t[k] = (target - at->t[k] * at->lambda[k] - (tried != NULL ? tried->t[k] * tried->lambda[k] : 0.0)) / at->t[k];
+        const double c_1 = tried != NULL ? tried->t[k] * tried->lambda[k] : 0.0;
+        c_t[k] = (target - at->t[k] * at->lambda[k] - c_1) / at->t[k];
         c_s[k] = (target - at->s[k] * at->mu[k] - (tried != NULL ? tried->s[k] * tried->mu[k] : 0.0)) / at->s[k];
         const double d_1 = at->lambda[k] / at->t[k];
         const double d_2 = at->mu[k] / at->s[k] + 2.0 * self->rho_2[k];
@@ -225,7 +229,8 @@ static bool solve_sets(ocp_qp_t *self, double d[], double multiplier[])
         if (self->kink[r] == OCP_OFF) {
             continue;
         }
-        double *reach = self->reach[self->kink[r] == OCP_ON ? ons : OCP_ROWS - 1]; /* the last is free while a row is over */
+        /* the last is free while a row is over */
+        double *reach = self->reach[self->kink[r] == OCP_ON ? ons : OCP_ROWS - 1];
         memset(reach, 0, sizeof self->reach[0]);
         for (int i = 0; i < frees && free[i] < self->support[r]; i++) {
             reach[i] = a[free[i]];
@@ -311,7 +316,8 @@ static int revise_sets(ocp_qp_t *self, const double d[], const double multiplier
         const uint8_t was = self->kink[r];
         const double excess = self->e[r] + dot(self->a[r], d, self->support[r]);
         if (was == OCP_ON) {
-            self->kink[r] = multiplier[r] < -WRONG ? OCP_OFF : multiplier[r] > self->rho_1[r] + WRONG ? OCP_OVER : OCP_ON;
+            const bool above = multiplier[r] > self->rho_1[r] + WRONG;
+            self->kink[r] = multiplier[r] < -WRONG ? OCP_OFF : above ? OCP_OVER : OCP_ON;
         } else if (was == OCP_OFF ? excess > WRONG : excess < -WRONG) {
             self->kink[r] = OCP_ON;
         }

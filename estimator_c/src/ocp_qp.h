@@ -1,9 +1,9 @@
 /* min 1/2 d'Hd + g'd + sum_i (rho_1i s_i + rho_2i s_i^2),  s_i = max(e_i + a_i d, 0),   low <= d <= high
  *
- * First by active sets: the guess in `bound` and `kink`, all that it gets wrong changed at once, a few times; with the sets of a
- * neighbouring problem that is one or two small factorisations, and the answer is exact. Where it does not settle,
- * Mehrotra's predictor and corrector, slacks and their multipliers eliminated row by row, from inside the box; its last
- * word is the active sets' again, if they agree. */
+ * First by active sets: the guess in `bound` and `kink`, all that it gets wrong changed at once, a few times; with the
+ * sets of a neighbouring problem that is one or two small factorisations, and the answer is exact. Where it does not
+ * settle, Mehrotra's predictor and corrector, slacks and their multipliers eliminated row by row, from inside the box;
+ * its last word is the active sets' again, if they agree. */
 #ifndef OCP_QP_H
 #define OCP_QP_H
 
@@ -34,10 +34,12 @@ typedef struct {
     double multiplier[OCP_ROWS];           /* of e_i + a_i d <= s_i */
     double decrease;                       /* of the objective from d = 0: > 0 unless that was the solution */
     int32_t iterations;                    /* interior points, each n^3/6 + rows n^2/4 products */
-    int32_t sets;                          /* active sets tried, each (free n)^3/6 products and one n^2 per row that is on */
+    /* active sets tried, each (free n)^3/6 products and one n^2 per row that is on */
+    int32_t sets;
 } ocp_qp_t;
 
-/* Solve. False: not finite, or not positive definite; d is not to be used. At most 40 iterations and 16 sets. No memory of its own; any thread with its own object. */
+/* Solve. False: not finite, or not positive definite; d is not to be used. At most 40 iterations and 16 sets.
+ * No memory of its own; any thread with its own object. */
 bool ocp_qp_solve(ocp_qp_t *self);
 
 #endif

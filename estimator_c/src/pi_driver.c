@@ -7,7 +7,8 @@ static double within(double x, double low, double high)
     return x > high ? high : x < low ? low : x;
 }
 
-pi_command_t pi_driver_step(pi_driver_t *self, const mpc_vehicle_t *vehicle, double v_mps, double v_ref_mps, double drive_limit_nm,
+pi_command_t pi_driver_step(pi_driver_t *self, const mpc_vehicle_t *vehicle, double v_mps, double v_ref_mps,
+                            double drive_limit_nm,
                             double regen_limit_nm, double share, double dt_s)
 {
     pi_command_t command = {0};

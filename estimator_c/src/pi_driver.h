@@ -1,4 +1,5 @@
-/* The driver of the plant, as a law that a controller can follow: proportional, integral, torque limits, friction for the rest. */
+/* The driver of the plant, as a law that a controller can follow: proportional, integral, torque limits, friction for
+ * the rest. */
 #ifndef PI_DRIVER_H
 #define PI_DRIVER_H
 
@@ -17,12 +18,14 @@ typedef struct {
     bool cut;           /* the share took driving torque away */
 } pi_command_t;
 
-/* One step of dt_s with the machine's limits (both >= 0) times share (0..1). At standstill with nothing wanted: no torque, no
- * integral. Pure but for the integral; 10 ns. */
-pi_command_t pi_driver_step(pi_driver_t *self, const mpc_vehicle_t *vehicle, double v_mps, double v_ref_mps, double drive_limit_nm,
+/* One step of dt_s with the machine's limits (both >= 0) times share (0..1). At standstill with nothing wanted: no
+ * torque, no integral. Pure but for the integral; 10 ns. */
+pi_command_t pi_driver_step(pi_driver_t *self, const mpc_vehicle_t *vehicle, double v_mps, double v_ref_mps,
+                            double drive_limit_nm,
                             double regen_limit_nm, double share, double dt_s);
 
 /* Another one drove: take over its torque without a jump. */
-void pi_driver_follow(pi_driver_t *self, const mpc_vehicle_t *vehicle, double v_mps, double v_ref_mps, double torque_nm);
+void pi_driver_follow(pi_driver_t *self, const mpc_vehicle_t *vehicle, double v_mps, double v_ref_mps,
+                      double torque_nm);
 
 #endif

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator_c.formulation.simd import ISAS, Isa
+
 ROOT = Path(__file__).resolve().parents[2]
 BASE = ROOT / "estimator_c"
 WEIGHTS = BASE / "weights" / "lstm8.json"
@@ -117,26 +119,30 @@ class _Head(ct.Structure):
 
 @cache
 def load(weights: Path = WEIGHTS, flags: tuple[str, ...] = ("-O2",)) -> Lib:
-    """The controller's library, compiled for this run; RT_LIBCONTROLLER names another one (an ASan build, say)."""
-    named = os.environ.get("RT_LIBCONTROLLER")
-    return Lib(Path(named) if named else compile_library(weights, flags))
+    """The controller's library: build/lib where that is asked for and there, else compiled for this run.
+
+    RT_LIBESTIMATOR names another one in its place (an ASan build, say).
+    """
+    built = Path(os.environ.get("RT_LIBESTIMATOR", ROOT / "build" / "lib" / "libestimator.so"))
+    plain = weights == WEIGHTS and flags == ("-O2",)
+    return Lib(built if plain and built.exists() else compile_library(weights, flags))
 
 
-def compile_library(weights: Path = WEIGHTS, flags: tuple[str, ...] = ("-O2",)) -> Path:
+def compile_library(weights: Path = WEIGHTS, flags: tuple[str, ...] = ("-O2",), isas: tuple[Isa, ...] = ISAS) -> Path:
     """Generate the C of `weights` and compile it into a folder of this run; returns the shared library."""
     from estimator_c.formulation.generate import generate
     from estimator_c.formulation.mpc_net import generate_mpc
 
     folder = Path(tempfile.gettempdir()) / f"rt-libctl-{os.getuid()}-{os.getpid()}"
-    key = hashlib.sha256(weights.read_bytes() + " ".join(flags).encode()).hexdigest()[:16]
+    key = hashlib.sha256(weights.read_bytes() + repr((flags, isas)).encode()).hexdigest()[:16]
     out = folder / key
     library = out / "libcontroller.so"
     if library.exists():
         return library
     if not folder.exists():
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    generated = [p for p in generate(weights, SETTINGS, out) if p.name.startswith("thermal_net")]
-    generated += generate_mpc(weights, MPC_SETTINGS, out)
+    generated = [p for p in generate(weights, SETTINGS, out, isas=isas) if p.name.startswith("thermal_net")]
+    generated += generate_mpc(weights, MPC_SETTINGS, out, isas)
     command = ["gcc", "-std=c11", "-D_GNU_SOURCE", "-g", "-fPIC", "-shared", *flags, f"-I{BASE / 'src'}", f"-I{out}"]
     command += [str(BASE / "src" / f"{name}.c") for name in SOURCES]
     command += [str(path) for path in generated if path.suffix == ".c"] + ["-o", str(library), "-lm"]

@@ -1,5 +1,5 @@
-/* The bulk work of ocp_kernel.h on vec_... functions of VEC_WIDTH doubles; included by the generated ocp_net_*.c, which have set
- * both and OCP_KERNEL, the name of the table. */
+/* The bulk work of ocp_kernel.h on vec_... functions of VEC_WIDTH doubles; included by the generated ocp_net_*.c,
+ * which have set both and OCP_KERNEL, the name of the table. */
 #include <math.h>
 #include <stddef.h>
 
@@ -98,11 +98,13 @@ static void differentiate(const double tape[], const double memory[], const ocp_
     }
 }
 
-enum { PAD = 8, TILE = 4, FORMS = 6 * H }; /* rows of a quadratic form: arguments of i, g, f, o, then c and new c, of each cell */
+/* rows of a quadratic form: arguments of i, g, f, o, then c and new c, of each cell */
+enum { PAD = 8, TILE = 4, FORMS = 6 * H };
 
 /* TILE rows of curve, `vectors` (1 or 2) vectors wide, in registers while all forms pass. */
 static inline __attribute__((always_inline)) void add_tile(const double left[][OCP_DIRECTIONS],
-                                                           const double right[][OCP_DIRECTIONS], int a, int b, int vectors,
+                                                           const double right[][OCP_DIRECTIONS], int a, int b,
+                                                               int vectors,
                                                            double curve[][OCP_DIRECTIONS])
 {
     vec_t sum[TILE][2];
@@ -202,7 +204,8 @@ static void push(const double tape[], const double memory[], const ocp_bar_t *ba
 }
 
 /* to[j] += sum of sign scale[k] row_k[j] for j >= from; GROUP vectors at a time stay in registers. */
-static inline void add_rows(double to[], int from, int n, const double row[][OCP_LD], const double scale[], int first, int last)
+static inline void add_rows(double to[], int from, int n, const double row[][OCP_LD], const double scale[], int first,
+                            int last)
 {
     for (int j = from - from % WIDTH; j < n; j += GROUP * WIDTH) {
         vec_t sum[GROUP];
@@ -236,7 +239,8 @@ static inline void add_rows(double to[], int from, int n, const double row[][OCP
     }
 }
 
-static void gram(double h[][OCP_LD], int n, const double row[][OCP_LD], const int32_t support[], const double weight[], int rows)
+static void gram(double h[][OCP_LD], int n, const double row[][OCP_LD], const int32_t support[],
+                 const double weight[], int rows)
 {
     double scale[2 * OCP_LD];
     int first = 0;
