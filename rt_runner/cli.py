@@ -10,7 +10,8 @@ import sys
 from rt_runner.errors import RtError
 
 VERBS = (
-    "run", "mil", "inspect", "timing", "report", "replay", "dataset", "train", "evaluate", "compare", "bench", "vcan"
+    "run", "mil", "inspect", "timing", "report", "replay", "dataset", "train", "evaluate", "compare",
+    "compare_control", "bench", "vcan",
 )  # fmt: skip
 
 
