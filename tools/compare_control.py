@@ -106,7 +106,7 @@ def compare(tasks: Sequence[Task], workers: int | None, done: Any) -> table.Foun
 
 def _lap_of(task: Task) -> Task:
     """The lap whose figures a task's are: who hears nothing, or the truth, drives the same whatever the sensors do."""
-    controller, feedback, case, seconds, seed = task
+    controller, feedback, _, seconds, _ = task
     if controller == "none":
         return controller, "ideal", "nominal", seconds, 0
     if feedback == "ideal":

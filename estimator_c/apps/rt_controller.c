@@ -1,5 +1,5 @@
-/* The controller process: command line, set-up, loop, end. What a cycle does is in ctl_cycle. The sibling of rt_estimator: the
- * same real-time loop, the same records in lock-step and in replay. */
+/* The controller process: command line, set-up, loop, end. What a cycle does is in ctl_cycle. The sibling of
+ * rt_estimator: the same real-time loop, the same records in lock-step and in replay. */
 #include <errno.h>
 #include <getopt.h>
 #include <inttypes.h>
@@ -21,7 +21,8 @@
 #include "rt_grant.h"
 #include "thermal_net.h"
 
-enum { DEFAULT_PERIOD_US = 100000, DEFAULT_PRIORITY = 79, MAX_CORE = 1023, MIN_WARMUP_RELEASES = 5, US_PER_S = 1000000 };
+enum { DEFAULT_PERIOD_US = 100000, DEFAULT_PRIORITY = 79, MAX_CORE = 1023 };
+enum { MIN_WARMUP_RELEASES = 5, US_PER_S = 1000000 };
 
 /* The value table of CtlBuild.controller_id. */
 static const char *const controller_names[] = {"none", "rule-150-155", "rule-145-160", "mpc-S", "mpc-M", "paper"};
@@ -75,7 +76,7 @@ static void usage(FILE *out) {
     (void)fputs("usage: rt_controller --bus socketcan:IFACE|rt_hub:PATH --preview FILE [--controller NAME] [--core N]\n"
                 "                     [--period-us 10000|20000|50000|100000] [--priority 1..99] [--no-rt]\n"
                 "       rt_controller --lockstep --preview FILE [--controller NAME] …   records on stdin and stdout\n"
-                "       rt_controller --replay   --preview FILE [--controller NAME] …   the same, and they say when each job ran\n"
+                "       rt_controller --replay   --preview FILE [--controller NAME] …   they say when each job ran, too\n"
                 "controllers: none, rule-150-155, rule-145-160, mpc-S, mpc-M (default), paper\n",
                 out);
 }
@@ -94,7 +95,8 @@ static int find_controller(const char *name, uint8_t *found) {
             return -1;
         }
     }
-    return fail("--controller: none is called '%s'; choose none, rule-150-155, rule-145-160, mpc-S, mpc-M or paper", name);
+    return fail("--controller: none is called '%s'; choose none, rule-150-155, rule-145-160, mpc-S, mpc-M or paper",
+                name);
 }
 
 static int parse_request(int choice, options *opt) {
@@ -124,7 +126,8 @@ static int check(options *opt, int argc, char **argv, const char *name) {
         return fail("'%s' is no option; see rt_controller --help", argv[optind]);
     }
     if (opt->lockstep == (opt->bus != NULL)) {
-        return fail("give either --bus socketcan:IFACE, --bus rt_hub:PATH, --lockstep or --replay; see rt_controller --help");
+        return fail("give either --bus socketcan:IFACE, --bus rt_hub:PATH, --lockstep or --replay; "
+                    "see rt_controller --help");
     }
     if (opt->preview == NULL) {
         return fail("--preview FILE is needed: the road ahead, as python -m plant_sim.preview writes it");
@@ -233,17 +236,17 @@ static int set_up(const options *opt, const est_io *io, const rt_granted *grante
     if (status == CTL_CYCLE_BAD_CONTROLLER && cycle.error == CONTROLLER_NO_NET) {
         return fail("controller '%s' needs a net of one layer of LSTM cells; build with such weights", name);
     }
-    return fail("controller '%s' does not fit this build (error %d); change estimator_c/settings/mpc and build again", name,
-                (int)cycle.error);
+    return fail("controller '%s' does not fit this build (error %d); change estimator_c/settings/mpc and build again",
+                name, (int)cycle.error);
 }
 
 static void report_ready(FILE *out, const options *opt, const rt_granted *granted) {
-    const ctl_report_identity identity = {controller_names[opt->controller], net_weights_sha256, DRIVE_DBC_SHA256, BUILD_SHA256,
-                                          preview.fingerprint, opt->period_us, granted};
+    const ctl_report_identity identity = {controller_names[opt->controller], net_weights_sha256, DRIVE_DBC_SHA256,
+                                          BUILD_SHA256, preview.fingerprint, opt->period_us, granted};
     ctl_report_ready(out, &identity);
 }
 
-/* ---- real time ---------------------------------------------------------------------------------------------------- */
+/* ---- real time ------------------------------------------------------------------------------------------------- */
 
 static void listen_to_ours(void) {
     struct can_filter wanted[CTL_RX_COUNT];
@@ -302,7 +305,7 @@ static int run_on_bus(const options *opt) {
     return exit_status;
 }
 
-/* ---- lock-step and replay ----------------------------------------------------------------------------------------- */
+/* ---- lock-step and replay -------------------------------------------------------------------------------------- */
 
 /* Runs the jobs released before `until_ns` (`inclusive`: at it, too). */
 static ctl_cycle_status run_releases(int64_t until_ns, bool inclusive) {
@@ -333,7 +336,8 @@ static int reader_left(void) {
 static int pass_time(const options *opt, const rt_record *record, bool tick) {
     if (opt->replay) { /* frames carry the time they arrived at, jobs the time they ran: their order is the log's */
         const bool sane = record->t_ns > -REPLAY_MAX_NS && record->t_ns < REPLAY_MAX_NS;
-        return sane ? -1 : fail("stdin: record time %lld ns; give times since the start of the grid", (long long)record->t_ns);
+        return sane ? -1
+                    : fail("stdin: record time %lld ns; give times since the start of the grid", (long long)record->t_ns);
     }
     if (est_lockstep_advance(&lockstep, record->t_ns) != EST_LOCKSTEP_OK) {
         return fail("stdin: record time from %lld to %lld ns; records must come in order of time, without leaps",
@@ -344,10 +348,11 @@ static int pass_time(const options *opt, const rt_record *record, bool tick) {
 
 static int replay_job(const rt_record *record) {
     const uint8_t *bytes = record->frame.data;
-    const uint32_t index = (uint32_t)bytes[1] | (uint32_t)bytes[2] << 8 | (uint32_t)bytes[3] << 16 | (uint32_t)bytes[4] << 24;
+    const uint32_t index =
+        (uint32_t)bytes[1] | (uint32_t)bytes[2] << 8 | (uint32_t)bytes[3] << 16 | (uint32_t)bytes[4] << 24;
     if (index <= cycle.task.last_index) {
-        return fail("stdin: release %lu comes after release %lu; jobs are replayed in their order", (unsigned long)index,
-                    (unsigned long)cycle.task.last_index);
+        return fail("stdin: release %lu comes after release %lu; jobs are replayed in their order",
+                    (unsigned long)index, (unsigned long)cycle.task.last_index);
     }
     return ctl_cycle_run_replayed(&cycle, index, record->t_ns) == CTL_CYCLE_OK ? -1 : reader_left();
 }
@@ -398,7 +403,7 @@ static int run_lockstep(const options *opt) {
     rt_environment_read(&run.end, true);
     if (exit_status != -1) {
         run.stopped_by = "input";
-        (void)rt_record_flush(&lockstep.writer); /* what was published before the mistake; the exit status tells of that */
+        (void)rt_record_flush(&lockstep.writer); /* what was published before the mistake */
     }
     ctl_report_final(stderr, &cycle, &run);
     if (ferror(stderr) != 0) {

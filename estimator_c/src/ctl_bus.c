@@ -3,8 +3,8 @@
 #include <math.h>
 #include <string.h>
 
-const enum drive_index ctl_rx_index[CTL_RX_COUNT] = {DRIVE_INDEX_MOTOR_STATE, DRIVE_INDEX_ESTIMATE, DRIVE_INDEX_EST_WINDING,
-                                                     DRIVE_INDEX_VEHICLE_STATE};
+const enum drive_index ctl_rx_index[CTL_RX_COUNT] = {
+    DRIVE_INDEX_MOTOR_STATE, DRIVE_INDEX_ESTIMATE, DRIVE_INDEX_EST_WINDING, DRIVE_INDEX_VEHICLE_STATE};
 
 static const timing_frames_table timing_table = {
     .job = {DRIVE_INDEX_CTL_TIMING_A, DRIVE_INDEX_CTL_TIMING_B, DRIVE_INDEX_CTL_TIMING_C, DRIVE_INDEX_CTL_TIMING_D},
@@ -48,7 +48,8 @@ static bool decode_estimate(const struct canfd_frame *frame, ctl_input *out) {
     out->tick = raw.tick;
     out->estimate.theta_w_degc = drive_estimate_theta_w_est_degc_to_phys(raw.theta_w_est_degc);
     out->estimate.theta_r_degc = drive_estimate_theta_r_est_degc_to_phys(raw.theta_r_est_degc);
-    out->estimate.usable = raw.status == OK || raw.status == PREDICTING || raw.status == OPEN_LOOP || raw.status == FALLBACK;
+    out->estimate.usable =
+        raw.status == OK || raw.status == PREDICTING || raw.status == OPEN_LOOP || raw.status == FALLBACK;
     return true;
 }
 
@@ -118,7 +119,8 @@ bool ctl_bus_stale(ctl_bus *self, int64_t now_ns) {
     bool any = false;
     for (int i = 0; i < CTL_RX_COUNT; i++) {
         ctl_rx *rx = &self->rx[i];
-        const bool stale = rx->alive && now_ns - rx->last_ns > (int64_t)drive_messages[ctl_rx_index[i]].timeout_ms * NS_PER_MS;
+        const int64_t timeout_ns = (int64_t)drive_messages[ctl_rx_index[i]].timeout_ms * NS_PER_MS;
+        const bool stale = rx->alive && now_ns - rx->last_ns > timeout_ns;
         rx->timeouts += stale && !rx->stale ? 1U : 0U;
         rx->stale = stale;
         any = any || stale;
@@ -231,8 +233,8 @@ static void solves(ctl_bus *self, const ctl_counters *in, struct canfd_frame *fr
 
 void ctl_bus_counter(ctl_bus *self, size_t which, const ctl_counters *in, struct canfd_frame *frame) {
     enum { OWN = CTL_COUNTER_FRAMES - TIMING_COUNTER_FRAMES };
-    static void (*const make[OWN])(ctl_bus *, const ctl_counters *, struct canfd_frame *) = {input_faults, bus_faults, fallbacks,
-                                                                                           solves};
+    static void (*const make[OWN])(ctl_bus *, const ctl_counters *, struct canfd_frame *) = {
+        input_faults, bus_faults, fallbacks, solves};
     if (which < OWN) {
         make[which](self, in, frame);
     } else {
@@ -269,7 +271,7 @@ static void granted(ctl_bus *self, const ctl_identity *in, struct canfd_frame *f
 }
 
 void ctl_bus_identity(ctl_bus *self, size_t which, const ctl_identity *in, struct canfd_frame *frame) {
-    static void (*const make[CTL_IDENTITY_FRAMES])(ctl_bus *, const ctl_identity *, struct canfd_frame *) = {hashes, build,
-                                                                                                           granted};
+    static void (*const make[CTL_IDENTITY_FRAMES])(ctl_bus *, const ctl_identity *, struct canfd_frame *) = {
+        hashes, build, granted};
     make[which](self, in, frame);
 }

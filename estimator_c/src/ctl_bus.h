@@ -1,9 +1,9 @@
-/* The controller's side of the bus: frames in, checked and decoded; frames out, clamped and protected. As est_bus for the
- * estimator: what is damaged or repeated never gets past ctl_bus_accept, trouble is a counter that only grows, and positions,
- * scalings, timeouts and data ids are those of the DBC.
+/* The controller's side of the bus: frames in, checked and decoded; frames out, clamped and protected. As est_bus
+ * for the estimator: what is damaged or repeated never gets past ctl_bus_accept, trouble is a counter that only
+ * grows, and positions, scalings, timeouts and data ids are those of the DBC.
  *
- * No clock, no socket, no allocation, no printing; times are int64 ns of the caller's time base. The caller owns the object;
- * one thread. */
+ * No clock, no socket, no allocation, no printing; times are int64 ns of the caller's time base. The caller owns
+ * the object; one thread. */
 #ifndef CTL_BUS_H
 #define CTL_BUS_H
 

@@ -4,7 +4,7 @@
 #include <stddef.h>
 #include <string.h>
 
-_Static_assert((int)CTL_CYCLE_FRAMES_PER_JOB <= 11, "send queue of a CAN interface and its controller: more would be lost");
+_Static_assert((int)CTL_CYCLE_FRAMES_PER_JOB <= 11, "what a CAN interface and its controller queue");
 
 static const int64_t NS_PER_S = 1000000000;
 static const int64_t IDENTITY_EVERY_S = 10;
@@ -78,7 +78,8 @@ static void feed_estimate(ctl_cycle *self) {
         return;
     }
     const bool together = self->winding_known && self->winding.tick == self->estimate.tick;
-    controller_feed_estimate(&self->controller, self->estimate.estimate.theta_w_degc, self->estimate.estimate.theta_r_degc,
+    controller_feed_estimate(&self->controller, self->estimate.estimate.theta_w_degc,
+                             self->estimate.estimate.theta_r_degc,
                              together ? self->winding.winding.sigma_degc : (double)NAN,
                              together ? self->winding.winding.upper_degc : (double)NAN, self->estimate.estimate.usable);
     self->estimate_new = false;
@@ -257,7 +258,8 @@ static ctl_cycle_status housekeeping(ctl_cycle *self, const rt_job *job) {
     return send_all(self, frames, count);
 }
 
-/* `now_ns`: when the inputs are read. In lock-step record time stands still while a job runs; in real time it is when we woke. */
+/* `now_ns`: when the inputs are read. In lock-step record time stands still while a job runs; in real time it is when we
+ * woke. */
 static ctl_cycle_status run(ctl_cycle *self, rt_job *job, int64_t now_ns) {
     controller_out_t out;
     bool sent = false;

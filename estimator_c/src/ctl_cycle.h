@@ -1,12 +1,13 @@
-/* One cycle of the controller process, the same in real time, lock-step and replay: read, check, control, publish, account.
+/* One cycle of the controller process, the same in real time, lock-step and replay: read, check, control, publish,
+ * account.
  *
  *     frames → ctl_bus (E2E, decode) → controller → ctl_bus (encode, E2E) → frames
  *
- * Frames leave in this order: TorqueCommand, CtlState, CtlSolve, then (response time known) CtlTimingA … CtlTimingD, then
- * housekeeping: once a second the counter frames, with the first job and every ten seconds the three identity frames. At most
- * eleven leave together. Without a fresh VehicleState, or before the first estimate where one is needed, the torques are sent as
- * not available: the plant then drives by itself, under its rule.
- * No allocation, no lock, no printing. One thread; the caller owns the object. */
+ * Frames leave in this order: TorqueCommand, CtlState, CtlSolve, then (response time known) CtlTimingA …
+ * CtlTimingD, then housekeeping: once a second the counter frames, with the first job and every ten seconds the
+ * three identity frames. At most eleven leave together. Without a fresh VehicleState, or before the first estimate
+ * where one is needed, the torques are sent as not available: the plant then drives by itself, under its rule. No
+ * allocation, no lock, no printing. One thread; the caller owns the object. */
 #ifndef CTL_CYCLE_H
 #define CTL_CYCLE_H
 
@@ -52,8 +53,9 @@ typedef struct {
     uint64_t sources[4];         /* jobs by controller_source_t */
 } ctl_cycle;
 
-/* Prepares everything and drives the controller along the beginning of its road, so that the first real job finds code and
- * data in memory. Copies all arguments; what `io.ctx` and `road` point to must outlive `self`. Milliseconds. */
+/* Prepares everything and drives the controller along the beginning of its road, so that the first real job finds
+ * code and data in memory. Copies all arguments; what `io.ctx` and `road` point to must outlive `self`.
+ * Milliseconds. */
 ctl_cycle_status ctl_cycle_init(ctl_cycle *self, const rt_task_config *config, const rt_clock *clock, const char *name,
                                 const controller_road_t *road, const est_io *io, const ctl_identity *identity);
 

@@ -44,8 +44,8 @@ static bool header(FILE *in, char line[LINE_LENGTH], uint32_t *hash, double head
 }
 
 static ctl_preview_status malformed(ctl_preview *self, long line) {
-    (void)snprintf(self->error, sizeof self->error, "line %ld is not that of a preview of 2 to %d points; write it with "
-                   "python -m plant_sim.preview", line, (int)CTL_PREVIEW_POINTS);
+    (void)snprintf(self->error, sizeof self->error, "line %ld is not that of a preview of 2 to %d points; write it "
+                   "with python -m plant_sim.preview", line, (int)CTL_PREVIEW_POINTS);
     return CTL_PREVIEW_MALFORMED;
 }
 

@@ -1,8 +1,8 @@
-/* The road ahead, read from the file that `python -m plant_sim.preview` writes: a line "rt-preview 1", a line with step in m,
- * number of points and look-ahead in m, then reference speed (m/s) and slope (rad) of every point.
+/* The road ahead, read from the file that `python -m plant_sim.preview` writes: a line "rt-preview 1", a line with
+ * step in m, number of points and look-ahead in m, then reference speed (m/s) and slope (rad) of every point.
  *
- * For set-up only: it reads a file with stdio. The caller owns the object (1 MB: static storage) and keeps it as long as the
- * controller that drives on it. */
+ * For set-up only: it reads a file with stdio. The caller owns the object (1 MB: static storage) and keeps it as
+ * long as the controller that drives on it. */
 #ifndef CTL_PREVIEW_H
 #define CTL_PREVIEW_H
 

@@ -27,8 +27,8 @@ void ctl_report_ready(FILE *out, const ctl_report_identity *identity) {
     }
     (void)fprintf(out, ",\"mlock\":%s,\"locked_kb\":%" PRId64 ",\"period_us\":%" PRId64 ",\"controller\":\"%s\"",
                   boolean(granted->mlock), granted->locked_kb, identity->period_us, identity->controller);
-    (void)fprintf(out, ",\"weights_hash\":\"%s\",\"dbc_hash\":\"%s\",\"build_hash\":\"%s\",\"preview_hash\":\"%06" PRIx32
-                  "\",\"warnings\":[", identity->weights_sha256, identity->dbc_sha256, identity->build_sha256,
+    (void)fprintf(out, ",\"weights_hash\":\"%s\",\"dbc_hash\":\"%s\",\"build_hash\":\"%s\""
+                  ",\"preview_hash\":\"%06" PRIx32 "\",\"warnings\":[", identity->weights_sha256, identity->dbc_sha256, identity->build_sha256,
                   identity->preview_hash);
     for (int i = 0; i < granted->warnings; i++) {
         (void)fputs(i > 0 ? "," : "", out);
@@ -70,11 +70,11 @@ static void put_core(FILE *out, const ctl_cycle *cycle) {
     static const char *const source_names[] = {"driver", "plan", "shifted_plan", "rule"};
     const controller_counters_t *c = &cycle->controller.counters;
     (void)fprintf(out,
-                  ",\"controller\":{\"solves\":%" PRIu32 ",\"failed\":%" PRIu32 ",\"slack_jumps\":%" PRIu32 ",\"unconverged\":%"
-                  PRIu32 ",\"shifted\":%" PRIu32 ",\"rule_steps\":%" PRIu32 ",\"clamped\":%" PRIu32 ",\"no_estimate\":%" PRIu32
+                  ",\"controller\":{\"solves\":%" PRIu32 ",\"failed\":%" PRIu32 ",\"slack_jumps\":%" PRIu32 ",\"unconverged\":%" PRIu32
+                  ",\"shifted\":%" PRIu32 ",\"rule_steps\":%" PRIu32 ",\"clamped\":%" PRIu32 ",\"no_estimate\":%" PRIu32
                   ",\"bad_inputs\":%" PRIu32 ",\"mute\":%" PRIu64 "},\"origins\":{",
-                  c->solves, c->failed, c->slack_jumps, c->unconverged, c->shifted, c->rule_steps, c->clamped, c->no_estimate,
-                  c->bad_inputs, cycle->mute_jobs);
+                  c->solves, c->failed, c->slack_jumps, c->unconverged, c->shifted, c->rule_steps, c->clamped,
+                  c->no_estimate, c->bad_inputs, cycle->mute_jobs);
     for (size_t i = 0; i < sizeof source_names / sizeof source_names[0]; i++) {
         (void)fprintf(out, "%s\"%s\":%" PRIu64, i > 0 ? "," : "", source_names[i], cycle->sources[i]);
     }
@@ -86,8 +86,8 @@ static void put_rx(FILE *out, const ctl_cycle *cycle) {
         const ctl_rx *rx = &cycle->bus.rx[i];
         const uint32_t *counts = rx->e2e.counts;
         (void)fprintf(out,
-                      "%s\"%s\":{\"ok\":%" PRIu32 ",\"repeated\":%" PRIu32 ",\"lost\":%" PRIu32 ",\"wrong_sequence\":%" PRIu32
-                      ",\"wrong_crc\":%" PRIu32 ",\"timeouts\":%" PRIu64 "}",
+                      "%s\"%s\":{\"ok\":%" PRIu32 ",\"repeated\":%" PRIu32 ",\"lost\":%" PRIu32
+                      ",\"wrong_sequence\":%" PRIu32 ",\"wrong_crc\":%" PRIu32 ",\"timeouts\":%" PRIu64 "}",
                       i > 0 ? "," : "", drive_messages[ctl_rx_index[i]].name, counts[E2E_OK], counts[E2E_REPEATED],
                       counts[E2E_LOST], counts[E2E_WRONG_SEQUENCE], counts[E2E_WRONG_CRC], rx->timeouts);
     }
@@ -99,10 +99,11 @@ void ctl_report_final(FILE *out, const ctl_cycle *cycle, const ctl_report_run *r
     (void)fprintf(out, "{\"final\":true,\"stopped_by\":\"%s\",", run->stopped_by);
     put_tally(out, &cycle->task.total);
     (void)fprintf(out,
-                  ",\"commands_sent\":%" PRIu64 ",\"commands_lost\":%" PRIu64 ",\"crc_errors\":%" PRIu64 ",\"seq_errors\":%" PRIu64
-                  ",\"stale_inputs\":%" PRIu64 ",\"rx_drops\":%" PRIu64 ",\"tx_drops\":%" PRIu64 ",\"rejected\":%" PRIu64
-                  ",\"foreign\":%" PRIu64,
-                  cycle->commands_sent, cycle->commands_lost, counters.crc_errors, counters.seq_errors, counters.stale_inputs,
+                  ",\"commands_sent\":%" PRIu64 ",\"commands_lost\":%" PRIu64 ",\"crc_errors\":%" PRIu64
+                  ",\"seq_errors\":%" PRIu64 ",\"stale_inputs\":%" PRIu64 ",\"rx_drops\":%" PRIu64 ",\"tx_drops\":%" PRIu64
+                  ",\"rejected\":%" PRIu64 ",\"foreign\":%" PRIu64,
+                  cycle->commands_sent, cycle->commands_lost, counters.crc_errors, counters.seq_errors,
+                  counters.stale_inputs,
                   counters.rx_drops, counters.tx_drops, counters.rejected, cycle->bus.foreign);
     put_core(out, cycle);
     for (size_t i = 0; i < RT_METRICS; i++) {
