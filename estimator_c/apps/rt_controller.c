@@ -76,7 +76,7 @@ static void usage(FILE *out) {
     (void)fputs("usage: rt_controller --bus socketcan:IFACE|rt_hub:PATH --preview FILE [--controller NAME] [--core N]\n"
                 "                     [--period-us 10000|20000|50000|100000] [--priority 1..99] [--no-rt]\n"
                 "       rt_controller --lockstep --preview FILE [--controller NAME] …   records on stdin and stdout\n"
-                "       rt_controller --replay   --preview FILE [--controller NAME] …   they say when each job ran, too\n"
+                "       rt_controller --replay   --preview FILE [--controller NAME] …   they say when jobs ran\n"
                 "controllers: none, rule-150-155, rule-145-160, mpc-S, mpc-M (default), paper\n",
                 out);
 }
@@ -337,7 +337,7 @@ static int pass_time(const options *opt, const rt_record *record, bool tick) {
     if (opt->replay) { /* frames carry the time they arrived at, jobs the time they ran: their order is the log's */
         const bool sane = record->t_ns > -REPLAY_MAX_NS && record->t_ns < REPLAY_MAX_NS;
         return sane ? -1
-                    : fail("stdin: record time %lld ns; give times since the start of the grid", (long long)record->t_ns);
+                    : fail("stdin: record time %lld ns; give times since the grid's start", (long long)record->t_ns);
     }
     if (est_lockstep_advance(&lockstep, record->t_ns) != EST_LOCKSTEP_OK) {
         return fail("stdin: record time from %lld to %lld ns; records must come in order of time, without leaps",

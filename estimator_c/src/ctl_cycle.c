@@ -258,8 +258,8 @@ static ctl_cycle_status housekeeping(ctl_cycle *self, const rt_job *job) {
     return send_all(self, frames, count);
 }
 
-/* `now_ns`: when the inputs are read. In lock-step record time stands still while a job runs; in real time it is when we
- * woke. */
+/* `now_ns`: when the inputs are read. In lock-step record time stands still while a job runs; in real time it is
+ * when we woke. */
 static ctl_cycle_status run(ctl_cycle *self, rt_job *job, int64_t now_ns) {
     controller_out_t out;
     bool sent = false;

@@ -28,7 +28,8 @@ void ctl_report_ready(FILE *out, const ctl_report_identity *identity) {
     (void)fprintf(out, ",\"mlock\":%s,\"locked_kb\":%" PRId64 ",\"period_us\":%" PRId64 ",\"controller\":\"%s\"",
                   boolean(granted->mlock), granted->locked_kb, identity->period_us, identity->controller);
     (void)fprintf(out, ",\"weights_hash\":\"%s\",\"dbc_hash\":\"%s\",\"build_hash\":\"%s\""
-                  ",\"preview_hash\":\"%06" PRIx32 "\",\"warnings\":[", identity->weights_sha256, identity->dbc_sha256, identity->build_sha256,
+                  ",\"preview_hash\":\"%06" PRIx32 "\",\"warnings\":[", identity->weights_sha256,
+                  identity->dbc_sha256, identity->build_sha256,
                   identity->preview_hash);
     for (int i = 0; i < granted->warnings; i++) {
         (void)fputs(i > 0 ? "," : "", out);
@@ -70,7 +71,8 @@ static void put_core(FILE *out, const ctl_cycle *cycle) {
     static const char *const source_names[] = {"driver", "plan", "shifted_plan", "rule"};
     const controller_counters_t *c = &cycle->controller.counters;
     (void)fprintf(out,
-                  ",\"controller\":{\"solves\":%" PRIu32 ",\"failed\":%" PRIu32 ",\"slack_jumps\":%" PRIu32 ",\"unconverged\":%" PRIu32
+                  ",\"controller\":{\"solves\":%" PRIu32 ",\"failed\":%" PRIu32 ",\"slack_jumps\":%" PRIu32
+                  ",\"unconverged\":%" PRIu32
                   ",\"shifted\":%" PRIu32 ",\"rule_steps\":%" PRIu32 ",\"clamped\":%" PRIu32 ",\"no_estimate\":%" PRIu32
                   ",\"bad_inputs\":%" PRIu32 ",\"mute\":%" PRIu64 "},\"origins\":{",
                   c->solves, c->failed, c->slack_jumps, c->unconverged, c->shifted, c->rule_steps, c->clamped,
@@ -100,7 +102,8 @@ void ctl_report_final(FILE *out, const ctl_cycle *cycle, const ctl_report_run *r
     put_tally(out, &cycle->task.total);
     (void)fprintf(out,
                   ",\"commands_sent\":%" PRIu64 ",\"commands_lost\":%" PRIu64 ",\"crc_errors\":%" PRIu64
-                  ",\"seq_errors\":%" PRIu64 ",\"stale_inputs\":%" PRIu64 ",\"rx_drops\":%" PRIu64 ",\"tx_drops\":%" PRIu64
+                  ",\"seq_errors\":%" PRIu64 ",\"stale_inputs\":%" PRIu64 ",\"rx_drops\":%" PRIu64
+                  ",\"tx_drops\":%" PRIu64
                   ",\"rejected\":%" PRIu64 ",\"foreign\":%" PRIu64,
                   cycle->commands_sent, cycle->commands_lost, counters.crc_errors, counters.seq_errors,
                   counters.stale_inputs,
