@@ -1,6 +1,7 @@
 """Each fault has one expected reaction: one clear line, a non-zero exit status, and a log that can be read."""
 
 import fcntl
+import itertools
 import json
 import os
 import signal
@@ -18,10 +19,12 @@ import pytest
 from rt_runner.codec import Encoder
 from rt_runner.dbc import load_dbc
 from rt_runner.hub_bus import HubBus
+from rt_runner.log_reader import LogReader
 from rt_runner.mcap_log import read_log, summarise
 from tests.support.runs import load_result, one_line, rt_runner, start_rt_runner
 
 RUN = ("run", "hot-lap", "--bus", "hub")
+LATE_NS = 50e6  # what a busy machine may add to a job, or take from a frame
 
 
 class LiveRun:
@@ -373,6 +376,31 @@ def test_a_killed_supervisor_takes_its_children_along_and_leaves_a_finished_log(
     assert summary.result is not None
     assert summary.result["verdict"] == "fail"
     assert summary.result["scenario"] == "hot-lap"
+
+
+def test_a_plant_that_is_held_up_is_stale_within_a_timeout_and_recovers(live):
+    """SIGSTOP, half a second, SIGCONT: judged from the log, where every job says whether its input was stale."""
+    run = live(6)
+    run.wait_for_estimates()
+    plant = run.pid("plant_sim")
+    time.sleep(0.5)
+    os.kill(plant, signal.SIGSTOP)
+    time.sleep(0.6)
+    os.kill(plant, signal.SIGCONT)
+    run.end()
+    frames = [(f.t_ns, f.name, f.values) for f in LogReader(run.log).frames()]
+    motor = [t for t, name, _ in frames if name == "MotorState"]
+    jobs = [(t, bool(v["stale_input"])) for t, name, v in frames if name == "EstTimingA"]
+    silence_ns, stopped = max((b - a, a) for a, b in itertools.pairwise(motor))
+    assert silence_ns > 500e6
+    timeout_ns, period_ns = DBC["MotorState"].timeout_ms * 1e6, 100e6
+    first_stale = next(t for t, stale in jobs if stale and t > stopped)
+    assert first_stale <= stopped + timeout_ns + period_ns + LATE_NS, "stale within one timeout, at the job after it"
+    spoken = stopped + silence_ns
+    assert all(stale for t, stale in jobs if stopped + timeout_ns + LATE_NS < t < spoken - LATE_NS)
+    after = [stale for t, stale in jobs if t > spoken + LATE_NS][:5]
+    assert after == [False] * 5, "fresh with the first job after it"
+    assert load_result(run.json)["timing"]["estimator"]["stale_jobs"] >= 4
 
 
 def test_frames_with_a_bad_crc_are_counted_and_not_believed(live):

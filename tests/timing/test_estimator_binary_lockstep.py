@@ -231,6 +231,41 @@ def test_what_is_damaged_or_foreign_changes_no_estimate(release, extras):
     assert bus_faults["rejected"] == final["rejected"]
 
 
+TROUBLES = {
+    # What is done to k frames, and what the receiver must count for it; what is missing shows with the next frame.
+    "drop": {"lost": 1, "frames_lost": 1},
+    "duplicate": {"repeated": 1},
+    "corrupt": {"wrong_crc": 1, "lost": 1, "frames_lost": 1},
+    "reorder": {"wrong_sequence": 1, "lost": 2, "frames_lost": 2},  # B A: A is missing, back to A, B is missing
+}
+
+
+@pytest.mark.parametrize("trouble", TROUBLES)
+@pytest.mark.parametrize("k", [1, 7])
+def test_k_frames_in_trouble_are_k_in_the_counters(release, trouble, k):
+    at = {100 + 20 * n for n in range(k)}
+    records, held = [], []
+    for record in drive(range(401)):
+        tick = record.t_ns // TICK_NS
+        if record.can_id != 0x0A0:
+            records.append(record)
+            continue
+        if trouble == "reorder" and tick in at:
+            held = [record]
+            continue
+        if tick in at:
+            damaged = bytes((*record.data[:4], record.data[4] ^ 0x10, *record.data[5:]))
+            records += {"drop": [], "duplicate": [record] * 2, "corrupt": [record._replace(data=damaged)]}[trouble]
+            continue
+        # What was held back comes behind the next frame, in that frame's time.
+        records += [record, *(h._replace(t_ns=record.t_ns) for h in held)]
+        held = []
+    counts = run_drive(release, records).final["rx"]["MotorState"]
+    expected = {name: k * n for name, n in TROUBLES[trouble].items()}
+    names = ("repeated", "lost", "wrong_sequence", "wrong_crc", "frames_lost")
+    assert {name: counts[name] for name in names} == {**dict.fromkeys(names, 0), **expected}
+
+
 def test_what_the_core_put_up_with_is_on_the_bus(program):
     """Stray ticks, values not available, temperatures off the grid and too late, a gap, a plant that starts again."""
     plant, records = Plant(), []
