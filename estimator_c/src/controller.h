@@ -11,7 +11,7 @@
  * one commands no motor torque.
  *
  * Everything: no allocation, no printing; one thread at a time per object; state sizeof(controller_t), owned by the
- * caller (about 300 kB, most of it the MPC's work space). Torques are at the motor's shaft. */
+ * caller (550 kB, most of it the MPC's work space). Torques are at the motor's shaft. */
 #ifndef CONTROLLER_H
 #define CONTROLLER_H
 

@@ -18,7 +18,7 @@
  * the true cost agrees to. The matrix is Gauss and Newton's plus the curvature of the temperatures in force, copper
  * loss being square in T. Its fixed point is the exact KKT point of the problem.
  *
- * Everything: no allocation, no clock, no printing; one thread at a time per object; the caller owns it. */
+ * Everything: no allocation, no clock, no printing; one thread at a time per object; the caller owns it (550 kB). Stack: 64 kB. */
 #ifndef MPC_H
 #define MPC_H
 
