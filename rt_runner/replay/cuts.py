@@ -20,17 +20,27 @@ MS = 1_000_000
 MOTOR_TIMEOUT_SLACK_NS = 20 * MS  # how wrong an age taken from stamps may be, where the status says so
 INPUT_STALE = 4
 ESTIMATES = (2, 3, 6, 7)  # statuses that a stale MotorState turns into INPUT_STALE
+STEP_NS = MS  # the grid moved (policy rebase) or the clock was set, if by more than this
 LOCKSTEP_SLACK_NS = 100_000  # stamps of lock-step logs are exact, other formats round them
 
 
-def _smoothed(offsets: Sequence[int | None]) -> list[int]:
-    """Median of the ten known offsets around each place; the nearest where there are none so near."""
+def _smoothed(offsets: Sequence[int | None], own: Sequence[int]) -> list[int]:
+    """Median of the ten known offsets on either side of each place.
+
+    Where the two sides disagree the grid moved: then that of the side which the place's own offset (``own``: known for
+    every place, but late on a bus that lags) belongs to, and where it moved more often than that, its own.
+    """
     places = [k for k, o in enumerate(offsets) if o is not None]
     known = [o for o in offsets if o is not None]
     out = []
-    for k in range(len(offsets)):
+    for k, mine in enumerate(own):
         at = bisect_right(places, k)
-        out.append(round(median(known[max(0, at - 10) : at + 10])))
+        sides = [median(side) for side in (known[max(0, at - 10) : at], known[at : at + 10]) if side]
+        if max(sides) - min(sides) <= STEP_NS:
+            out.append(round(median(known[max(0, at - 10) : at + 10])))
+            continue
+        side = min(sides, key=lambda s: abs(s - mine))
+        out.append(round(side) if abs(side - mine) <= STEP_NS else mine)
     return out
 
 
@@ -70,9 +80,8 @@ class Evidence:
         From the stamps of Estimate, late on a bus that lags; where there are ages, from the stamps of the inputs.
         """
         jobs = self._session.jobs
-        coarse = _smoothed(
-            [j.t_ns - (0 if j.wake_ns is None else j.response_ns or 0) - j.release * self._period_ns for j in jobs]
-        )
+        own = [j.t_ns - (0 if j.wake_ns is None else j.response_ns or 0) - j.release * self._period_ns for j in jobs]
+        coarse = _smoothed(own, own)
         self._grid_ns = coarse
         fine: list[int | None] = []
         for k, job in enumerate(jobs):
@@ -81,7 +90,9 @@ class Evidence:
                 motor = self._motor(job, self.start_by_grid(k), max(job.inputs_before, 1))
             offset_ns = (job.age_motor_ns or 0) - (job.wake_ns or 0) - job.release * self._period_ns
             fine.append(None if motor is None else self._inputs[motor].t_ns + offset_ns)
-        return coarse if all(f is None for f in fine) else _smoothed(fine)
+        if all(f is None for f in fine):
+            return coarse
+        return _smoothed(fine, [o if f is None else f for f, o in zip(fine, own, strict=True)])
 
     def start_by_grid(self, k: int) -> int:
         """When job ``k`` began, from its index, its wake-up latency and the grid."""

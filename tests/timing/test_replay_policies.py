@@ -33,7 +33,7 @@ class Witness(OnBus):
         ((*PERIOD, "--on-miss", "invalid", *LATE), {0.0, 3.0}),
         ((*PERIOD, "--policy", "cut:30000", "--inject", "compute:60000@55", "--inject", "compute:60000@57"), {0.0}),
         ((*PERIOD, "--policy", "queue:2", *LATE), {0.0}),
-        ((*PERIOD, "--policy", "rebase", *LATE), {0.0}),
+        ((*PERIOD, "--policy", "rebase", "--on-miss", "invalid", *LATE), {0.0, 3.0}),
         (("--no-rt", "--trigger", "frame", "--inject", "sleep:30000@25"), {0.0}),
     ],
     ids=["hold", "predict", "invalid", "cut", "queue", "rebase", "frame"],
