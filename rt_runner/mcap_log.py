@@ -24,6 +24,7 @@ from rt_runner.codec import Decoded, Decoder
 from rt_runner.dbc import Dbc
 from rt_runner.log_reader import LogError, LogFrame, LogReader, RawFrame, read_log
 from rt_runner.log_summary import LogSummary, MessageSummary, summarise
+from rt_runner.mcap_chunk import speed_up
 
 __all__ = [
     "LogError", "LogFrame", "LogReader", "LogSummary", "LogWriter", "MessageSummary", "RawFrame",
@@ -187,6 +188,7 @@ class LogWriter:
         self._last_ns = 0
         self.frames = 0
         self._writer = Writer(self._disk, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        speed_up(self._writer)
         try:
             self._writer.start(profile="", library=LIBRARY)
             self.metadata("run", run_metadata or {})

@@ -114,5 +114,6 @@ def test_a_frame_that_is_no_good_releases_nothing():
         result = talk.finish()
     finally:
         hub.stop()
+    assert result.final is not None
     assert result.final["crc_errors"] == 3
     assert result.final["jobs"] == 0
