@@ -73,6 +73,17 @@ def miss_rate_bounds(misses: int, releases: int, confidence: float = CONFIDENCE)
     return lower, upper
 
 
+def releases_to_pass(misses: int, limit: float) -> int:
+    """Fewest releases with so many misses whose rate is proven to be at most ``limit``, 0 < limit < 1."""
+    low, high = misses, misses + 1
+    while miss_rate_bounds(misses, high)[1] > limit:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if miss_rate_bounds(misses, middle)[1] > limit else (low, middle)
+    return high
+
+
 @dataclass(frozen=True)
 class Finding:
     """One thing that was judged: its name, how it came out (pass | fail | inconclusive), and the evidence."""
@@ -98,8 +109,9 @@ def judge_misses(misses: int, by_machine: int, releases: int, limit: float, mach
     if upper <= limit:
         return Finding("miss rate", "pass", says)
     if lower <= limit:
-        need = math.ceil(math.log(1 - CONFIDENCE) / math.log1p(-limit))
-        hint = f"; too few to decide, run longer (at least {need} releases)" if releases < 4 * need else "; undecided"
+        few = releases < 4 * releases_to_pass(0, limit)
+        longer = f"too few to decide, run longer ({releases_to_pass(misses, limit)} releases without another miss pass)"
+        hint = f"; {longer}" if few else "; undecided"
         return Finding("miss rate", "inconclusive", says + hint)
     own_lower, _ = miss_rate_bounds(misses - by_machine, releases)
     if own_lower <= limit:

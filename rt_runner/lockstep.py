@@ -21,7 +21,7 @@ from rt_runner.mcap_log import LogError, LogWriter
 from rt_runner.provenance import Provenance
 from rt_runner.records import CONTROL_ID, END, TICK, Record, control, pack, read_until_control
 from rt_runner.result import ResultAccumulator, RunFacts
-from rt_runner.timing_config import timing_options
+from rt_runner.timing_config import grace_releases, timing_options
 
 PROGRESS_NS = 1_000_000_000
 
@@ -109,6 +109,7 @@ def run_lockstep(
         limits=scenario.limits,
         faults=scenario.all_faults,
         mk=scenario.timing.mk,
+        grace_releases=grace_releases(scenario.timing.grace_s, e.period_s),
     )
     accumulator = ResultAccumulator()
     peers: list[_Peer] = []

@@ -68,6 +68,7 @@ class RunFacts:
     log_cut_short: bool = False  # the logger could not take all that had arrived
     faults: tuple[str, ...] = ()  # of the sensors, as text
     mk: tuple[int, int] | None = None  # at most m misses in any K releases
+    grace_releases: int | None = None  # releases of start-up grace; None: an older log does not say
     restarts: tuple[str, ...] = ()  # how processes ended that were then started again
 
     @staticmethod
@@ -289,8 +290,10 @@ class ResultAccumulator:
                     **self._timing.figures(),
                     **{k: _whole(self._value(m, k)) for m, ks in OWN_COUNTS.items() for k in ks},
                     "phase_us": self._value("EstMissRun", "phase_us"),
-                    "mk": None if facts.mk is None else {"m": facts.mk[0], "k": facts.mk[1],
-                                                         "worst": self._timing.worst_of(facts.mk[1])},
+                    "mk": None if facts.mk is None else {
+                        "m": facts.mk[0], "k": facts.mk[1],
+                        "worst": self._timing.worst_of(facts.mk[1], facts.grace_releases),
+                    },
                 }
             },
             "granted": {k: facts.granted.get(k) for k in ("policy", "core", "mlock")},
@@ -344,13 +347,13 @@ class ResultAccumulator:
     def _judge_timing(self, facts: RunFacts, dropped: int) -> list[Finding]:
         jobs, out = self._timing.jobs, []
         if not facts.lockstep:
-            judged = self._timing.judged()
+            judged = self._timing.judged(facts.grace_releases)
             limit = facts.limits.miss_rate_max
             finding = judge_misses(judged.misses, judged.by_machine, judged.releases, limit, self._machine(facts))
             if finding.verdict == "fail" and dropped:
                 finding = replace(finding, verdict="inconclusive", evidence=f"{finding.evidence}; but the log has gaps")
             out.append(finding)
-            out += [self._timing.judge_mk(facts.mk, dropped)] if facts.mk else []
+            out += [self._timing.judge_mk(facts.mk, dropped, facts.grace_releases)] if facts.mk else []
         own_releases, own_jobs = self._count("EstReleases", "releases"), self._count("EstReleases", "jobs")
         own_skipped = self._count("EstMisses", "miss_skipped")
         if not own_releases or own_releases >= RELEASES_LAST or own_skipped >= SKIPPED_LAST:

@@ -17,7 +17,7 @@ from rt_runner.controller import controller_command, preview
 from rt_runner.errors import RtError, SetupError
 from rt_runner.provenance import Provenance
 from rt_runner.result import RunFacts
-from rt_runner.timing_config import timing_options
+from rt_runner.timing_config import grace_releases, timing_options
 
 LOGGER_READY_S = 30.0
 READY_S = 90.0  # the plant compiles its kernel at first use and drives to the scenario's start
@@ -121,6 +121,7 @@ class Supervisor:
             limits=scenario.limits,
             faults=scenario.all_faults,
             mk=scenario.timing.mk,
+            grace_releases=grace_releases(scenario.timing.grace_s, scenario.estimator.period_s),
         )
 
     def _plant_command(self, bus: str) -> list[str]:

@@ -51,6 +51,7 @@ class TimingAccount:
         self._flags = {"cut": 0, "queued": 0}
         self._missed: list[int] = []  # judged releases, ascending
         self._in_warmup = self._was_late = False
+        self._crossing = (0, 0, CAUSES[0])  # skips between warm-up and the first judged job: first, count, cause
         self._last_cause = "none"
         self._samples: dict[str, list[float]] = {name: [] for name in DURATIONS}
 
@@ -66,6 +67,8 @@ class TimingAccount:
             skipped = max(0, release - self._last_release - 1)
             self.skipped += skipped
             self._causes[self._last_cause] += skipped
+            if not warmup and self._in_warmup:
+                self._crossing = release - skipped, skipped, self._last_cause
             if not warmup:
                 self._judged_causes[self._last_cause] += skipped
                 self._missed += range(release - skipped, release)
@@ -110,33 +113,41 @@ class TimingAccount:
             if v.get(name) is not None:
                 into.append(v[name])
 
-    def judged(self) -> Misses:
-        """What a miss rate is judged by: the releases after warm-up."""
-        releases = self.jobs - self.warmup_jobs + self.skipped - self._warmup_skipped
-        misses = self.late + self.skipped - self._warmup_misses
-        return Misses(releases, misses, min(misses, sum(self._judged_causes[c] for c in MACHINE_CAUSES)))
+    def judged(self, grace: int | None = None) -> Misses:
+        """What a miss rate is judged by: the releases after warm-up.
 
-    def worst_of(self, k: int) -> int:
+        ``grace``: so many are warm-up, also of those that a job of warm-up ran over. None: unknown, these are judged.
+        """
+        first, count, cause = self._crossing
+        early = 0 if grace is None else min(max(grace + 1 - first, 0), count)
+        releases = self.jobs - self.warmup_jobs + self.skipped - self._warmup_skipped - early
+        misses = self.late + self.skipped - self._warmup_misses - early
+        by_machine = sum(self._judged_causes[c] for c in MACHINE_CAUSES) - (early if cause in MACHINE_CAUSES else 0)
+        return Misses(releases, misses, min(misses, by_machine))
+
+    def worst_of(self, k: int, grace: int | None = None) -> int:
         """Most misses among any ``k`` consecutive judged releases."""
         worst, window = 0, deque()
         for release in self._missed:
+            if grace is not None and release <= grace:
+                continue
             window.append(release)
             while release - window[0] >= k:
                 window.popleft()
             worst = max(worst, len(window))
         return worst
 
-    def judge_mk(self, mk: tuple[int, int], dropped: int) -> Finding:
+    def judge_mk(self, mk: tuple[int, int], dropped: int, grace: int | None = None) -> Finding:
         """At most m misses in any K consecutive releases, as far as the log has them."""
         m, k = mk
-        worst = self.worst_of(k)
+        worst, releases = self.worst_of(k, grace), self.judged(grace).releases
         says = f"at most {worst} misses in any {k} consecutive releases, {m} allowed"
         if worst > m:
             if dropped:
                 return Finding("(m, K)", "inconclusive", f"{says}; but the log has gaps")
             return Finding("(m, K)", "fail", says)
-        if self.judged().releases < k:
-            return Finding("(m, K)", "inconclusive", f"{says}; only {self.judged().releases} releases: run longer")
+        if releases < k:
+            return Finding("(m, K)", "inconclusive", f"{says}; only {releases} releases: run longer")
         return Finding("(m, K)", "pass", says)
 
     def figures(self) -> dict:

@@ -14,6 +14,7 @@ ON_MISS = ("late", "hold", "predict", "invalid")
 TRIGGERS = ("time", "frame")
 QUEUE_MAX, MK_MAX, MISSES_MAX, INJECTIONS_MAX, INJECTION_MAX_US = 64, 100, 10**9, 64, 60_000_000
 GRACE_MAX_RELEASES = 1_000_000
+GRACE_DEFAULT_S, GRACE_LEAST_RELEASES = 1.0, 5  # where the scenario says nothing
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,13 @@ def _check_policy(policy: str, period_s: float, what: str) -> None:
         raise UsageError(f"{what}: {match[2]} is more than {most}, {why}")
 
 
+def grace_releases(grace_s: float | None, period_s: float) -> int:
+    """The first so many releases are start-up grace: the loop's own rule, for who reads its log."""
+    if grace_s is None:
+        return max(GRACE_LEAST_RELEASES, math.ceil(GRACE_DEFAULT_S / period_s - 1e-9))
+    return math.ceil(grace_s / period_s - 1e-9)
+
+
 def timing_options(t: TimingConfig, period_s: float, trigger: str, *, lockstep: bool = False) -> list[str]:
     """The estimator's options for it; none for what it does by itself.
 
@@ -117,7 +125,7 @@ def timing_options(t: TimingConfig, period_s: float, trigger: str, *, lockstep: 
                                    ("--trigger", trigger, "time")):  # fmt: skip
         options += [option, value] if value != default else []
     if t.grace_s is not None:
-        options += ["--grace-releases", str(math.ceil(t.grace_s / period_s - 1e-9))]
+        options += ["--grace-releases", str(grace_releases(t.grace_s, period_s))]
     if t.mk is not None:
         options += ["--mk", f"{t.mk[0]},{t.mk[1]}"]
     options += [] if t.canary or lockstep else ["--no-canary"]

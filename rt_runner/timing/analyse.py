@@ -2,6 +2,7 @@
 
 from array import array
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -22,6 +23,7 @@ from rt_runner.timing.metrics import derive, summaries
 from rt_runner.timing.misses import MissAccount, account
 from rt_runner.timing.setup import TimingSetup, final_of, setup_of
 from rt_runner.timing.summary import Summary
+from rt_runner.timing_config import grace_releases
 
 STATISTICS = ("WakeStat", "ExecStat", "RespStat")
 EVIDENCE = ("Machine", "Environment", "Canary", "Overload", "Outputs")
@@ -139,8 +141,8 @@ def _process(
     if told_us is not None:
         setup = setup.with_period(round(told_us * 1e3))
     derive(jobs, setup.deadline_ns)
-    misses = account(jobs)
     final = final_of(reader, process.final)
+    misses = account(jobs, _grace(process, final, setup))
     published = {m: _newest(log, process.prefix + m) for m in (*EVIDENCE, "MissRun", *STATISTICS)}
     rebased = int(published["Overload"].get("rebased") or 0)
     grid = setup.trigger == "time" and not setup.facts.lockstep
@@ -176,6 +178,13 @@ def _process(
         published=published,
         findings=_judge(process, misses, done, final, setup),
     )
+
+
+def _grace(process: Process, final: Mapping[str, Any] | None, setup: TimingSetup) -> int:
+    """Releases of warm-up: by the process's own count; without its last words by its rule."""
+    with suppress(KeyError, TypeError, ValueError):
+        return int((final or {})["warmup"]["releases"])
+    return grace_releases(setup.grace_s if process.sender == "ESTIMATOR" else None, setup.period_ns / 1e9)
 
 
 def _newest(log: LogColumns, name: str) -> dict[str, float | None]:
@@ -221,6 +230,8 @@ def _mk_finding(process: Process, misses: MissAccount, mk: tuple[int, int]) -> F
     m, k = mk
     worst = misses.worst(k, misses.judged_from)
     says = f"at most {worst} misses in any {k} releases, allowed {m}"
+    if worst <= m and misses.judged.releases < k:
+        return Finding(f"{process.name} (m,K)", "inconclusive", f"{says}; only {misses.judged.releases}: run longer")
     return Finding(f"{process.name} (m,K)", "pass" if worst <= m else "fail", says)
 
 

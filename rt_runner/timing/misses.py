@@ -83,11 +83,14 @@ def _near(runs: list[tuple[int, int]], start: int, window: int) -> list[tuple[in
     return [r for r in runs if r[1] > start and r[0] < start + window]
 
 
-def account(jobs: Jobs) -> MissAccount:
-    """Go through the jobs once. A skipped release has the cause of the job that ran over it."""
+def account(jobs: Jobs, grace: int = 0) -> MissAccount:
+    """Go through the jobs once. A skipped release has the cause of the job that ran over it.
+
+    ``grace``: releases of warm-up, as far as no job tells: those skipped between its last job and the first one after.
+    """
     warmup, judged = Misses(), Misses()
     runs: list[tuple[int, int]] = []
-    before, unseen, cause_before = None, 0, CAUSES[0]
+    before, warm_before, unseen, cause_before = None, True, 0, CAUSES[0]
     late, warm, after_skip = jobs.flags["late"], jobs.flags["warmup"], jobs.flags["after_skip"]
 
     def miss(first: int, count: int) -> None:
@@ -102,7 +105,9 @@ def account(jobs: Jobs) -> MissAccount:
         window = warmup if warm[k] else judged
         gap = 0 if before is None else release - before - 1
         if gap > 0 and after_skip[k]:
-            window.skipped[cause_before] += gap
+            early = gap if warm[k] else min(max(grace - before, 0), gap) if warm_before else 0  # type: ignore[operator]
+            warmup.skipped[cause_before] += early
+            judged.skipped[cause_before] += gap - early
             miss(before + 1, gap)  # type: ignore[operator]
         elif gap > 0:
             unseen += gap
@@ -113,5 +118,5 @@ def account(jobs: Jobs) -> MissAccount:
             miss(release, 1)
         elif cause_before != CAUSES[0]:
             window.other[cause_before] += 1
-        before = release
+        before, warm_before = release, bool(warm[k])
     return MissAccount(warmup, judged, runs, unseen)

@@ -27,6 +27,7 @@ class TimingSetup:
     on_miss: str = "late"
     trigger: str = "time"
     mk: tuple[int, int] | None = None
+    grace_s: float | None = None  # of start-up; None: the process's own rule
     logged: int | None = None  # frames of the DBC, by the logger's own count
 
     def with_period(self, period_ns: int) -> "TimingSetup":
@@ -70,6 +71,7 @@ def setup_of(reader: LogReader) -> TimingSetup:
         on_miss=str(timing.get("on_miss", "late")),
         trigger=str(estimator.get("trigger", "time")),
         mk=(int(mk[0]), int(mk[1])) if isinstance(mk, list | tuple) and len(mk) == 2 else None,
+        grace_s=_number(timing.get("grace_s")),
         logged=_logged(reader),
     )
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rt_runner.judge import Finding, judge_misses, miss_rate_bounds, overall, percentile
+from rt_runner.judge import Finding, judge_misses, miss_rate_bounds, overall, percentile, releases_to_pass
 
 
 def test_no_miss_has_the_closed_form_upper_bound():
@@ -79,3 +79,15 @@ def test_percentile_is_a_sample_that_enough_samples_do_not_exceed(samples, p):
 def test_a_percentile_of_too_few_samples_is_not_named():
     assert percentile(sorted(range(99)), 99) is None
     assert percentile(sorted(range(100)), 99) == 98
+
+
+@pytest.mark.parametrize(("misses", "limit"), [(0, 0.05), (0, 0.5), (1, 0.05), (4, 0.05), (20, 0.01)])
+def test_the_hint_names_the_fewest_releases_that_pass(misses, limit):
+    enough = releases_to_pass(misses, limit)
+    assert judge_misses(misses, 0, enough, limit).verdict == "pass"
+    assert judge_misses(misses, 0, enough - 1, limit).verdict == "inconclusive"
+
+
+def test_four_misses_need_more_releases_than_none():
+    assert releases_to_pass(0, 0.05) == 59
+    assert "181 releases without another miss" in judge_misses(4, 0, 74, 0.05).evidence

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rt_runner.timing_account import CAUSES, TimingAccount
+from rt_runner.timing_account import CAUSES, MACHINE_CAUSES, TimingAccount
 
 JOB = st.tuples(st.integers(0, 3), st.booleans(), st.integers(0, len(CAUSES) - 1), st.integers(0, 3))
 JOBS = st.lists(JOB, max_size=60)
@@ -43,6 +43,21 @@ def test_worst_window_and_totals(jobs, warmup, k):
     assert figures["jobs"] == len(jobs) == sum(figures["outputs"].values())
     assert figures["releases"] == figures["jobs"] + figures["miss_skipped"]
     assert sum(figures["causes"].values()) == figures["miss_late"] + figures["miss_skipped"]
+
+
+@given(JOBS, st.integers(0, 30), st.integers(1, 100))
+def test_what_a_job_of_warm_up_ran_over_is_judged_from_the_end_of_grace_on(jobs, grace, k):
+    account, _ = account_of(jobs, grace)
+    missed, cause_before = [], 0
+    for n, (skipped, late, cause, _) in enumerate(jobs):
+        missed += [(True, cause_before)] * (skipped if n else 0) + [(late, cause)]
+        cause_before = cause
+    judged = missed[grace:]
+    by_machine = sum(miss and CAUSES[cause] in MACHINE_CAUSES for miss, cause in judged)
+    found = account.judged(grace)
+    assert (found.releases, found.misses, found.by_machine) == (len(judged), sum(m for m, _ in judged), by_machine)
+    windows = [sum(m for m, _ in judged[j : j + k]) for j in range(len(judged))]
+    assert account.worst_of(k, grace) == max(windows, default=0)
 
 
 def test_the_verdict_on_m_in_k():

@@ -6,7 +6,7 @@ import pytest
 
 from rt_runner.config import load_scenario
 from rt_runner.errors import UsageError
-from rt_runner.timing_config import TimingConfig, timing_options
+from rt_runner.timing_config import TimingConfig, grace_releases, timing_options
 from tests.timing.estimator_process import binary
 
 LAP = 'duration_s = 5.0\n[cycle]\nkind = "lap"\n'
@@ -50,6 +50,14 @@ def test_what_cannot_be_is_one_line(tmp_path, timing, estimator, says):
         scenario(tmp_path, timing, estimator)
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("grace_s", "period_s", "releases"),
+    [(None, 0.1, 10), (None, 1.0, 5), (None, 0.003, 334), (0.0, 0.1, 0), (0.25, 0.1, 3), (0.3, 0.1, 3)],
+)
+def test_grace_in_releases(grace_s, period_s, releases):
+    assert grace_releases(grace_s, period_s) == releases
 
 
 def test_lock_step_has_no_time_to_make_faults_in():
