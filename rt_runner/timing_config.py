@@ -23,7 +23,8 @@ class TimingConfig:
 
     ``policy`` says what becomes of the releases that pass while a job runs, ``on_miss`` what a late job puts out,
     ``grace_s`` how long misses are not judged (None: a second, at least five releases), ``mk`` that at most m of any K
-    consecutive releases may be missed, ``inject`` faults made on purpose (``compute:US@RELEASE``).
+    consecutive releases may be missed, ``inject`` faults made on purpose (``compute:US@RELEASE``), ``deadline_s`` from
+    the release to the output (None: the period).
     """
 
     policy: str = "skip"
@@ -32,6 +33,7 @@ class TimingConfig:
     mk: tuple[int, int] | None = None
     canary: bool = True
     inject: tuple[str, ...] = ()
+    deadline_s: float | None = None
 
 
 def timing_from(values: dict, where: str) -> TimingConfig:
@@ -48,6 +50,7 @@ def timing_from(values: dict, where: str) -> TimingConfig:
         "grace_s": (lambda v: isinstance(v, int | float) and not isinstance(v, bool), "a number"),
         "mk": (lambda v: isinstance(v, list) and [type(x) for x in v] == [int, int], "two whole numbers [m, K]"),
         "canary": (lambda v: isinstance(v, bool), "true or false"),
+        "deadline_s": (lambda v: isinstance(v, int | float) and not isinstance(v, bool), "a number"),
         "inject": (lambda v: isinstance(v, list) and all(isinstance(x, str) for x in v), "a list of texts"),
     }
     for key, value in values.items():
@@ -57,8 +60,9 @@ def timing_from(values: dict, where: str) -> TimingConfig:
         if not fits(value):
             raise UsageError(f"{where} {key} = {value!r}: must be {shape}")
     taken: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
-    if "grace_s" in taken:
-        taken["grace_s"] = float(taken["grace_s"])
+    for key in ("grace_s", "deadline_s"):
+        if key in taken:
+            taken[key] = float(taken[key])
     return TimingConfig(**taken)
 
 
@@ -70,7 +74,9 @@ def check_timing(t: TimingConfig, period_s: float, trigger: str, where: str) -> 
     UsageError
         One line: what, where, what to do.
     """
-    _check_policy(t.policy, period_s, f"{where}: policy = '{t.policy}'")
+    if t.deadline_s is not None and not 1e-6 <= t.deadline_s <= period_s:
+        raise UsageError(f"{where}: deadline_s = {t.deadline_s:g} must lie in 1e-06 … {period_s:g}, the period")
+    _check_policy(t.policy, period_s if t.deadline_s is None else t.deadline_s, f"{where}: policy = '{t.policy}'")
     if trigger not in TRIGGERS:
         raise UsageError(f"{where}: trigger = '{trigger}' is none of {', '.join(TRIGGERS)}")
     if trigger == "frame" and t.policy.partition(":")[0] in ("queue", "rebase"):
@@ -90,15 +96,15 @@ def check_timing(t: TimingConfig, period_s: float, trigger: str, where: str) -> 
             raise UsageError(f"{where}: inject '{text}' is neither {known}")
 
 
-def _check_policy(policy: str, period_s: float, what: str) -> None:
+def _check_policy(policy: str, deadline_s: float, what: str) -> None:
     match = _POLICY.fullmatch(policy)
     if match is None:
         raise UsageError(f"{what} is none of {POLICIES}")
     if match[1] is None:
         return
-    most = {"queue": QUEUE_MAX, "cut": round(period_s * 1e6)}.get(match[1], MISSES_MAX)
+    most = {"queue": QUEUE_MAX, "cut": round(deadline_s * 1e6)}.get(match[1], MISSES_MAX)
     if int(match[2]) > most:
-        why = "the period" if match[1] == "cut" else "the most"
+        why = "the deadline" if match[1] == "cut" else "the most"
         raise UsageError(f"{what}: {match[2]} is more than {most}, {why}")
 
 
@@ -124,6 +130,8 @@ def timing_options(t: TimingConfig, period_s: float, trigger: str, *, lockstep: 
     for option, value, default in (("--policy", t.policy, "skip"), ("--on-miss", t.on_miss, "late"),
                                    ("--trigger", trigger, "time")):  # fmt: skip
         options += [option, value] if value != default else []
+    if t.deadline_s is not None:
+        options += ["--deadline-us", str(round(t.deadline_s * 1e6))]
     if t.grace_s is not None:
         options += ["--grace-releases", str(grace_releases(t.grace_s, period_s))]
     if t.mk is not None:

@@ -29,6 +29,7 @@ typedef struct {
     const char *bus;
     const est_setting_t *setting;
     int64_t period_us;
+    int64_t deadline_us;     /* 0: the period */
     rt_request request;
     rt_reaction reaction;
     est_on_miss on_miss;
@@ -80,6 +81,7 @@ static bool was_written(const char *what) {
 
 static void usage(FILE *out) {
     (void)fputs("usage: rt_estimator --bus socketcan:IFACE|rt_hub:PATH [--setting NAME] [--period-us 1000..1000000]\n"
+                "                    [--deadline-us 1..period]\n"
                 "                    [--core N] [--priority 1..99] [--no-rt] [--no-canary]\n"
                 "                    [--trigger time|frame] [--policy skip|queue:N|rebase|cut:US|stop:total:M|stop:row:M]\n"
                 "                    [--on-miss late|hold|predict|invalid] [--grace-releases N] [--mk M,K]\n"
@@ -163,8 +165,14 @@ static int check(options *opt) {
     if (opt->lockstep == (opt->bus != NULL)) {
         return fail("give either --bus socketcan:IFACE, --bus rt_hub:PATH, --lockstep or --replay; see rt_estimator --help");
     }
-    if (!rt_reaction_valid(&opt->reaction, opt->period_us * 1000)) {
-        return fail("--policy: a cut budget must not be longer than the period of %lld us", (long long)opt->period_us);
+    if (opt->deadline_us > opt->period_us) {
+        return fail("--deadline-us: a deadline of %lld us lies behind the period of %lld us; give at most the period",
+                    (long long)opt->deadline_us, (long long)opt->period_us);
+    }
+    opt->deadline_us = opt->deadline_us > 0 ? opt->deadline_us : opt->period_us;
+    if (!rt_reaction_valid(&opt->reaction, opt->deadline_us * 1000)) {
+        return fail("--policy: a cut budget must not be longer than the deadline of %lld us (the period, unless told)",
+                    (long long)opt->deadline_us);
     }
     if (opt->on_frame && opt->reaction.overrun != RT_OVERRUN_SKIP) {
         return fail("--policy: queue and rebase are for the time grid; with --trigger frame give skip, cut or stop");
@@ -183,6 +191,7 @@ static int check(options *opt) {
 static int parse(int argc, char **argv, options *opt) {
     static const struct option table[] = {
         {"bus", required_argument, NULL, 'b'},      {"setting", required_argument, NULL, 's'},
+        {"deadline-us", required_argument, NULL, 'd'},
         {"period-us", required_argument, NULL, 't'}, {"core", required_argument, NULL, 'c'},
         {"priority", required_argument, NULL, 'p'},  {"no-rt", no_argument, NULL, 'n'},
         {"lockstep", no_argument, NULL, 'l'},        {"help", no_argument, NULL, 'h'},
@@ -212,6 +221,12 @@ static int parse(int argc, char **argv, options *opt) {
                             MAX_PERIOD_US);
             }
             opt->period_us = number;
+            break;
+        case 'd':
+            if (!parse_number(optarg, 1, MAX_PERIOD_US, &number)) {
+                return fail("--deadline-us: '%s' is not a deadline; give 1 to the period", optarg);
+            }
+            opt->deadline_us = number;
             break;
         case 'c':
             if (!parse_number(optarg, 0, MAX_CORE, &number)) {
@@ -306,7 +321,7 @@ static est_cycle_status set_up(const options *opt, const est_io *io, const rt_gr
     const est_identity identity = identity_of(opt, granted);
     rt_task_config config = {
         .period_ns = opt->period_us * 1000,
-        .deadline_ns = opt->period_us * 1000,
+        .deadline_ns = opt->deadline_us * 1000,
         .t0_ns = 0,
         .warmup_releases = (uint64_t)((US_PER_S + opt->period_us - 1) / opt->period_us),
         .virtual_time = opt->lockstep,

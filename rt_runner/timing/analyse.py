@@ -3,7 +3,7 @@
 from array import array
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -140,6 +140,8 @@ def _process(
     told_us = _newest(log, f"{process.prefix}Granted").get("period_us")  # each process may have a period of its own
     if told_us is not None:
         setup = setup.with_period(round(told_us * 1e3))
+    if process.sender != "ESTIMATOR":  # the scenario's [timing] is the estimator's
+        setup = replace(setup, deadline_ns=setup.period_ns, policy="skip", mk=None)
     derive(jobs, setup.deadline_ns)
     final = final_of(reader, process.final)
     misses = account(jobs, _grace(process, final, setup))

@@ -84,6 +84,20 @@ def test_skip_leaves_out_whole_periods():
     assert final_of(result)["skipped_causes"]["long_compute"] == 3
 
 
+def test_a_deadline_before_the_next_release_is_missed_without_an_overrun():
+    deadline = ("--deadline-us", str(PERIOD_US // 2), "--on-miss", "invalid")
+    result = undisturbed({LONG}, *deadline, "--inject", f"compute:{PERIOD_US * 3 // 4}@{LONG}")
+    conserved(result)
+    assert counts(result) == {
+        "overrun": 0, "miss_late": 1, "miss_skipped": 0, "queued": 0, "cut": 0, "rebased": 0, "consec_miss_max": 1,
+    }  # fmt: skip
+    job = jobs_of(result)[LONG]
+    assert (job["miss_cause"], job["output"]) == (3, 3), "long compute, put out as invalid"
+    slack = final_of(result)["slack_us"]
+    assert slack["min_index"] == LONG
+    assert PERIOD_US / 2 - slack["min"] == pytest.approx(job["resp_us"], abs=0.2)
+
+
 def test_queue_runs_what_fits_late_and_in_order():
     result = undisturbed({LONG, LONG + 1, LONG + 2}, *INJECT, "--policy", "queue:2")
     conserved(result)
@@ -184,7 +198,10 @@ def test_what_a_late_job_puts_out(on_miss):
     ("args", "says"),
     [
         (("--policy", "queue:0"), "--policy: 'queue:0'"),
-        (("--policy", "cut:60000"), "must not be longer than the period"),
+        (("--policy", "cut:60000"), "must not be longer than the deadline of 50000 us"),
+        (("--deadline-us", "50001"), "behind the period of 50000 us"),
+        (("--deadline-us", "0"), "--deadline-us: '0'"),
+        (("--deadline-us", "20000", "--policy", "cut:20001"), "the deadline of 20000 us"),
         (("--policy", "rebase", "--trigger", "frame"), "are for the time grid"),
         (("--on-miss", "guess"), "--on-miss: 'guess'"),
         (("--mk", "3,3"), "--mk: '3,3'"),

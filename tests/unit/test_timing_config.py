@@ -30,7 +30,12 @@ def test_all_of_it_is_read(tmp_path):
         ('policy = "wait"', "", "is none of skip, queue:N"),
         ('policy = "queue:65"', "", "65 is more than 64"),
         ('policy = "queue:0"', "", "is none of"),
-        ('policy = "cut:50001"', "", "50001 is more than 50000, the period"),
+        ('policy = "cut:50001"', "", "50001 is more than 50000, the deadline"),
+        ('policy = "cut:20001"\ndeadline_s = 0.02', "", "20001 is more than 20000, the deadline"),
+        ("deadline_s = 0.0501", "", "deadline_s = 0.0501 must lie in"),
+        ("deadline_s = 0", "", "deadline_s = 0 must lie in"),
+        ("deadline_s = nan", "", "deadline_s = nan must lie in"),
+        ('deadline_s = "soon"', "", "must be a number"),
         ('policy = "rebase"', 'trigger = "frame"', "is for the time grid"),
         ("", 'trigger = "event"', "trigger = 'event' is none of time, frame"),
         ('on_miss = "guess"', "", "on_miss = 'guess'"),
@@ -76,6 +81,8 @@ def test_lock_step_has_no_time_to_make_faults_in():
         (TimingConfig("stop:total:1000000000", "invalid"), "time"),
         (TimingConfig("stop:row:1"), "frame"),
         (TimingConfig("rebase"), "time"),
+        (TimingConfig("cut:20000", deadline_s=0.02), "time"),
+        (TimingConfig(deadline_s=0.05), "frame"),
     ],
 )
 def test_the_estimator_takes_what_passes_here(timing, trigger):

@@ -158,10 +158,11 @@ def _decimation_note(trace: Trace) -> str:
 
 
 def _deadline(data: ReportData, scale: str) -> list[dict[str, Any]]:
-    if data.period_s is None:
+    deadline_s = data.deadline_s
+    if deadline_s is None:
         return []
     what = "release period" if data.lockstep else "deadline"
-    return [{"scale": scale, "value": data.period_s * 1e6, "label": f"{what} {_milli(data.period_s)}"}]
+    return [{"scale": scale, "value": deadline_s * 1e6, "label": f"{what} {_milli(deadline_s)}"}]
 
 
 def _milli(seconds: float) -> str:
@@ -229,7 +230,7 @@ def _response_chart(data: ReportData) -> dict[str, Any]:
         series += _line(Trace(jobs.t_s, values), label, "µs", "us", colour, 1, style="dots", width=1)
     marks = [
         ("late", "--miss", False, jobs.t_s[jobs.late], jobs.resp_us[jobs.late]),
-        ("skipped", "--skip", True, jobs.skipped_t_s, _at_deadline(jobs, data.period_s)),
+        ("skipped", "--skip", True, jobs.skipped_t_s, _at_deadline(jobs, data.deadline_s)),
     ]
     notes = []
     for label, colour, hollow, t_s, y in marks:
@@ -268,8 +269,8 @@ def _response_chart(data: ReportData) -> dict[str, Any]:
     }
 
 
-def _at_deadline(jobs: Jobs, period_s: float | None) -> Array:
-    return np.full(jobs.skipped_t_s.shape, np.nan if period_s is None else period_s * 1e6)
+def _at_deadline(jobs: Jobs, deadline_s: float | None) -> Array:
+    return np.full(jobs.skipped_t_s.shape, np.nan if deadline_s is None else deadline_s * 1e6)
 
 
 def _thin(count: int) -> NDArray[np.int64]:

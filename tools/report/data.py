@@ -131,3 +131,9 @@ class ReportData:
     environment: tuple[tuple[str, str], ...] = ()
     notices: tuple[str, ...] = ()
     timing: TimingReport | None = None  # None: no real-time process in the log
+
+    @property
+    def deadline_s(self) -> float | None:
+        """Of the estimator: one period, unless the scenario says less."""
+        own = [p for p in self.timing.processes if p.process.sender == "ESTIMATOR"] if self.timing is not None else []
+        return own[-1].deadline_ns / 1e9 if own and not self.lockstep else self.period_s
