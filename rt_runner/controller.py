@@ -11,6 +11,8 @@ from rt_runner import paths
 from rt_runner.config import ControllerConfig, Scenario
 from rt_runner.errors import SetupError
 
+PREVIEW_NAME = "preview.txt"  # in the log: its 24-bit fingerprint is CtlBuild.preview_hash
+
 
 @contextlib.contextmanager
 def preview(scenario: Scenario) -> Iterator[Path]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from rt_runner import paths
 from rt_runner.children import spawn
 from rt_runner.config import Scenario
-from rt_runner.controller import controller_command, preview
+from rt_runner.controller import PREVIEW_NAME, controller_command, preview
 from rt_runner.dbc import Dbc
 from rt_runner.errors import RtError, SetupError
 from rt_runner.mcap_log import LogError, LogWriter
@@ -110,15 +110,19 @@ def run_lockstep(
         faults=scenario.all_faults,
         mk=scenario.timing.mk,
         grace_releases=grace_releases(scenario.timing.grace_s, e.period_s),
+        controller=c.name if c.present else None,
     )
     accumulator = ResultAccumulator()
     peers: list[_Peer] = []
     with contextlib.ExitStack() as stack:
         stack.callback(lambda: [peer.close() for peer in peers])
         commands = {"plant": plant_command, "estimator": estimator_command}
+        attachments: dict[str, str | Path | bytes] = {**provenance.files}
+        attachments |= {k: v.encode() for k, v in provenance.texts.items()}
         if c.present:
             road = stack.enter_context(preview(scenario))
             commands["controller"] = controller_command(c, road, ["--lockstep", "--no-rt"])
+            attachments[PREVIEW_NAME] = road
         peers += [_Peer(name, command) for name, command in commands.items()]
         plant, estimator, *others = peers
         try:
@@ -126,7 +130,6 @@ def run_lockstep(
         except RtError as error:
             raise SetupError(str(error)) from None
         granted = next((line for line in estimator.json_lines() if "ready" in line), {})
-        attachments = {**provenance.files, **{k: v.encode() for k, v in provenance.texts.items()}}
         with LogWriter(log, dbc, provenance.run, attachments) as writer:
             try:
                 _shuttle(first, plant, [estimator, *others], writer, accumulator, progress)

@@ -120,24 +120,14 @@ def summary(result: dict, log: Path | None) -> str:
                 f"raw sensor {raw} degC"
             )
     lines += sensor_lines(result)
-    t = result["timing"]["estimator"]
-    lines.append(
-        f"{'jobs':<10} {t['jobs']} at {t['period_s'] * 1e3:g} ms, {t['miss_late']} late, {t['miss_skipped']} skipped"
-    )
-    for key, title in (("wake_lat_us", "wake-up"), ("exec_wall_us", "execution"), ("resp_us", "response")):
-        q = t[key]
-        if q["max"] is not None:
-            lines.append(
-                f"{title:<10} "
-                + ", ".join(f"{k} {'n/a' if q[k] is None else format(q[k], '.1f')}" for k in ("p50", "p99", "max"))
-                + " us"
-            )
-    lines += timing_lines(t)
+    lines += node_lines(result["timing"]["estimator"])
     g = result["granted"]
     if g["policy"] is not None:
         lines.append(
             f"{'granted':<10} {g['policy']}, core {g['core']}, memory {'locked' if g['mlock'] else 'not locked'}"
         )
+    if "controller" in result["timing"]:
+        lines += controller_lines(result)
     lines.append(
         f"{'log':<10} {result['log']['frames']} frames, {result['log']['dropped']} dropped"
         + (f", {log}" if log else "")
@@ -146,6 +136,28 @@ def summary(result: dict, log: Path | None) -> str:
         lines.append(f"{f['verdict']:<12} {f['what']}: {f['evidence']}")
     lines.append(f"verdict: {result['verdict']}")
     return "\n".join(lines)
+
+
+def controller_lines(result: dict) -> list[str]:
+    """The controller's loop, and what became of it, under a line of its own."""
+    c = result["controller"]
+    words = (("mute", "commands not available"), ("shifted", "by the shifted plan"), ("by_rule", "by the rule"),
+             ("clamped", "clamped"), ("failed", "solves failed"), ("unconverged", "not converged"))  # fmt: skip
+    shown = [f"{c[key]} {word}" for key, word in words if c[key]]
+    lines = [f"controller {c['name']}:" if c["name"] else "controller:", *node_lines(result["timing"]["controller"])]
+    return lines + ([f"{'commands':<10} {', '.join(shown)}"] if shown else [])
+
+
+def node_lines(t: dict) -> list[str]:
+    """The loop of one node: jobs, durations, policy."""
+    period = "n/a" if t["period_s"] is None else f"{t['period_s'] * 1e3:g}"
+    lines = [f"{'jobs':<10} {t['jobs']} at {period} ms, {t['miss_late']} late, {t['miss_skipped']} skipped"]
+    for key, title in (("wake_lat_us", "wake-up"), ("exec_wall_us", "execution"), ("resp_us", "response")):
+        q = t[key]
+        if q["max"] is not None:
+            shown = (f"{k} {'n/a' if q[k] is None else format(q[k], '.1f')}" for k in ("p50", "p99", "max"))
+            lines.append(f"{title:<10} {', '.join(shown)} us")
+    return lines + timing_lines(t)
 
 
 def timing_lines(t: dict) -> list[str]:

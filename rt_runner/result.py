@@ -6,37 +6,31 @@ the report when they read. What no frame can tell (which bus, who crashed, stole
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 
-from rt_runner.judge import Finding, judge_misses, overall
+from rt_runner.judge import Finding, overall
+from rt_runner.node_account import RELEASES_LAST as RELEASES_LAST
+from rt_runner.node_account import SKIPPED_LAST as SKIPPED_LAST
+from rt_runner.node_account import NodeAccount, Terms
 from rt_runner.sensor_account import SensorAccount
 from rt_runner.timing_account import CAUSES as CAUSES
 from rt_runner.timing_account import MACHINE_CAUSES as MACHINE_CAUSES
 from rt_runner.timing_account import RELEASE_BITS as RELEASE_BITS
-from rt_runner.timing_account import TimingAccount
 from rt_runner.timing_account import Unwrapper as Unwrapper
+from rt_runner.timing_config import grace_releases
 
 TICK_S = 0.01
 TICK_BITS = 16
-RELEASES_LAST, SKIPPED_LAST = (1 << 24) - 2, (1 << 16) - 2  # counters stop at their last valid code
 SETTLE_S = 10.0  # accuracy is judged from here after the first estimate: the net's memory starts empty
 REPEATED, WRONG_CRC = 1, 4  # E2E states as in the log
 STATUS_SHOWN = ("init", "starting", "ok", "predicting", "input_stale", "invalid", "open_loop", "fallback")
-# What only the loop's own counters say; null where an older log has them not.
-OWN_COUNTS = {
-    "EstMisses": ("overrun",),
-    "EstOverload": ("queued", "cut", "rebased"),
-    "EstMissRun": ("consec_miss_max", "mk_worst"),
-    "EstOutputs": ("held", "predicted", "invalidated"),
-}
-ENVIRONMENT = {
-    "EstEnvironment": ("minor_faults", "major_faults", "invol_switches"),
-    "EstMachine": ("run_delay_ms", "migrations"),
-    "EstCanary": ("canary_p99_us", "canary_max_us"),
-}
 CORE_FAULTS = {
     "EstCoreFaults": ("restarts", "held_intervals", "late_measurements", "stray_ticks"),
     "EstCoreFaults2": ("off_grid", "invalid_inputs", "unconverged", "repeated_ticks"),
+}
+CONTROLLER_COUNTS = {
+    "Fallbacks": ("mute", "shifted", "by_rule", "clamped"),
+    "Solves": ("failed", "unconverged", "no_estimate", "bad_inputs"),
 }
 
 
@@ -70,6 +64,7 @@ class RunFacts:
     mk: tuple[int, int] | None = None  # at most m misses in any K releases
     grace_releases: int | None = None  # releases of start-up grace; None: an older log does not say
     restarts: tuple[str, ...] = ()  # how processes ended that were then started again
+    controller: str | None = None  # the name of the one that closes the loop
 
     @staticmethod
     def from_dict(values: dict) -> "RunFacts":
@@ -107,7 +102,7 @@ class ResultAccumulator:
         self._truth, self._sensor, self._estimate = _Trace(), _Trace(), _Trace()
         self._sensors = SensorAccount()
         self._first_estimate_tick: int | None = None
-        self._timing = TimingAccount()
+        self._estimator, self._controller = NodeAccount("Est", "estimator"), NodeAccount("Ctl", "controller")
         self._last: dict[str, dict[str, float | None]] = {}
         self._counter: dict[str, int] = {}
         self._frames = self._lost = self._damaged = 0
@@ -136,6 +131,8 @@ class ResultAccumulator:
             if before is not None and e2e != REPEATED:  # a repeat is no gap
                 self._lost += (int(counter) - before - 1) % 16
             self._counter[name] = int(counter)
+        self._estimator.feed(name, values)
+        self._controller.feed(name, values)
         handler = getattr(self, f"_on_{name}", None)
         if handler is not None:
             handler(values)
@@ -236,25 +233,9 @@ class ResultAccumulator:
             out[channel] = self._sensors.channel(channel, lambda tick, key=key: self._true_at(tick, key), errors)
         return {**out, "calibration": self._sensors.calibration()}
 
-    # ---- timing ---------------------------------------------------------------------------------------
-    def _on_EstTimingA(self, v: dict) -> None:
-        self._timing.job_a(v)
-
-    def _on_EstTimingB(self, v: dict) -> None:
-        self._timing.job_b(v)
-
-    def _on_EstTimingC(self, v: dict) -> None:
-        self._timing.job_c(v)
-
-    def _on_EstTimingD(self, v: dict) -> None:
-        self._timing.job_d(v)
-
     def _count(self, message: str, signal: str) -> int:
         value = self._last.get(message, {}).get(signal)
         return 0 if value is None else int(value)
-
-    def _value(self, message: str, signal: str) -> float | None:
-        return self._last.get(message, {}).get(signal)
 
     # ---- the result -----------------------------------------------------------------------------------
     def result(self, facts: RunFacts) -> dict:
@@ -267,6 +248,7 @@ class ResultAccumulator:
         """
         accuracy = {c: self._accuracy(f"{c}_degc") for c in ("theta_w", "theta_r")}
         span_s = (self._last_ns - self._first_ns) / 1e9 if self._first_ns is not None else 0.0
+        closed = self._closed(facts)
         dropped = max(self._lost, facts.log_dropped)  # the same frames, seen by their counters and by the kernel
         findings = [
             *self._judge_run(facts),
@@ -285,31 +267,43 @@ class ResultAccumulator:
             "accuracy": accuracy,
             "sensors": self._sensor_accounts(),
             "timing": {
-                "estimator": {
-                    "period_s": facts.period_s,
-                    **self._timing.figures(),
-                    **{k: _whole(self._value(m, k)) for m, ks in OWN_COUNTS.items() for k in ks},
-                    "phase_us": self._value("EstMissRun", "phase_us"),
-                    "mk": None if facts.mk is None else {
-                        "m": facts.mk[0], "k": facts.mk[1],
-                        "worst": self._timing.worst_of(facts.mk[1], facts.grace_releases),
-                    },
-                }
+                "estimator": self._estimator.figures(facts.period_s, facts.mk, facts.grace_releases),
+                **({"controller": self._controller.figures(self._controller_period_s())} if closed else {}),
             },
             "granted": {k: facts.granted.get(k) for k in ("policy", "core", "mlock")},
             "environment": {
                 "steal_ms": facts.steal_ms,
                 "warnings": facts.granted.get("warnings", []),
-                **{k: self._value(m, k) for m, ks in ENVIRONMENT.items() for k in ks},
+                **self._estimator.environment(),
             },
-            "input_faults": {k: self._count("EstInputFaults", k) for k in ("crc_errors", "seq_errors", "stale_inputs")},
-            "bus_faults": {k: self._count("EstBusFaults", k) for k in ("rx_drops", "tx_drops", "rejected")},
+            "input_faults": self._estimator.faults("input"),
+            "bus_faults": self._estimator.faults("bus"),
             "core_faults": {k: self._count(m, k) for m, ks in CORE_FAULTS.items() for k in ks},
             "plant": {
                 "ticks_late": self._count("PlantStatus", "ticks_late"),
                 "late_max_ms": self._last.get("PlantStatus", {}).get("late_max_ms"),
             },
             "log": {"frames": self._frames, "dropped": dropped, "damaged": self._damaged},
+            **({"controller": self._controller_figures(facts)} if closed else {}),
+        }
+
+    def _closed(self, facts: RunFacts) -> bool:
+        """Whether a controller was to close the loop, or did."""
+        return facts.controller is not None or self._controller.heard
+
+    def _controller_period_s(self) -> float | None:
+        period_us = self._controller.value("Granted", "period_us")
+        return None if period_us is None else period_us / 1e6
+
+    def _controller_figures(self, facts: RunFacts) -> dict:
+        """What became of the controller beside its loop's timing."""
+        node = self._controller
+        return {
+            "name": facts.controller,
+            **{k: node.count(m, k) for m, ks in CONTROLLER_COUNTS.items() for k in ks},
+            "input_faults": node.faults("input"),
+            "bus_faults": node.faults("bus"),
+            "environment": {"steal_ms": node.value("Machine", "steal_ms"), **node.environment()},
         }
 
     def _judge_run(self, facts: RunFacts) -> list[Finding]:
@@ -345,43 +339,16 @@ class ResultAccumulator:
         return out
 
     def _judge_timing(self, facts: RunFacts, dropped: int) -> list[Finding]:
-        jobs, out = self._timing.jobs, []
-        if not facts.lockstep:
-            judged = self._timing.judged(facts.grace_releases)
-            limit = facts.limits.miss_rate_max
-            finding = judge_misses(judged.misses, judged.by_machine, judged.releases, limit, self._machine(facts))
-            if finding.verdict == "fail" and dropped:
-                finding = replace(finding, verdict="inconclusive", evidence=f"{finding.evidence}; but the log has gaps")
-            out.append(finding)
-            out += [self._timing.judge_mk(facts.mk, dropped, facts.grace_releases)] if facts.mk else []
-        own_releases, own_jobs = self._count("EstReleases", "releases"), self._count("EstReleases", "jobs")
-        own_skipped = self._count("EstMisses", "miss_skipped")
-        if not own_releases or own_releases >= RELEASES_LAST or own_skipped >= SKIPPED_LAST:
-            return out  # nothing was counted yet, or a counter stands at its last code: no account to compare
-        # The counters were sent once a second; jobs logged since then are the difference, never a deficit.
-        if own_releases != own_jobs + own_skipped:
-            says = f"estimator counted {own_releases} releases, but {own_jobs} jobs + {own_skipped} skipped"
-            out.append(Finding("conservation", "fail", says))
-        elif jobs < own_jobs:
-            says = f"estimator executed {own_jobs} jobs, only {jobs} of them are in the log"
-            out.append(Finding("conservation", "inconclusive", says))
-        else:
-            says = f"{own_releases} releases = {own_jobs} jobs + {own_skipped} skipped"
-            waiting = self._count("EstOverload", "waiting")
-            says += f" (and {waiting} wait)" if waiting else ""
-            out.append(Finding("conservation", "pass", says))
+        limit = facts.limits.miss_rate_max
+        terms = Terms(limit, facts.mk, facts.grace_releases, facts.lockstep, facts.steal_ms, dropped)
+        out = self._estimator.judge(terms)
+        if self._closed(facts):
+            period_s = self._controller_period_s()
+            grace = None if period_s is None else grace_releases(None, period_s)
+            steal_ms = self._controller.value("Machine", "steal_ms")
+            terms = Terms(limit, None, grace, facts.lockstep, steal_ms, dropped)
+            out += self._controller.judge(terms, "controller")
         return out
-
-    def _machine(self, facts: RunFacts) -> str:
-        """What speaks for the machine having been taken from us, in words; empty where nothing was measured."""
-        shown = []
-        p99, largest = (self._value("EstCanary", k) for k in ("canary_p99_us", "canary_max_us"))
-        if largest is not None:
-            shown.append(f"canary up to {largest:.0f} us late" + (f" (p99 {p99:.0f} us)" if p99 is not None else ""))
-        shown += [f"{facts.steal_ms:.0f} ms stolen"] if facts.steal_ms is not None else []
-        delay = self._value("EstMachine", "run_delay_ms")
-        shown += [f"{delay:.1f} ms ready but not run"] if delay is not None else []
-        return ", ".join(shown)
 
     def _judge_log(self, dropped: int, cut_short: bool) -> Finding:
         trouble = [f"{dropped} frames missing"] if dropped else []
@@ -390,10 +357,6 @@ class ResultAccumulator:
         if trouble:
             return Finding("log", "inconclusive", f"{', '.join(trouble)}: figures may be wrong")
         return Finding("log", "pass", f"{self._frames} frames, none missing by their counters")
-
-
-def _whole(count: float | None) -> int | None:
-    return None if count is None else int(count)
 
 
 def _rms(errors: list[float]) -> float | None:

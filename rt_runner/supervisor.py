@@ -13,7 +13,7 @@ from rt_runner import machine, paths
 from rt_runner.bus import HUB_PRIORITY, BusChoice, HubProcess
 from rt_runner.children import Child, ChildError
 from rt_runner.config import Scenario
-from rt_runner.controller import controller_command, preview
+from rt_runner.controller import PREVIEW_NAME, controller_command, preview
 from rt_runner.errors import RtError, SetupError
 from rt_runner.provenance import Provenance
 from rt_runner.result import RunFacts
@@ -102,7 +102,10 @@ class Supervisor:
         """Started first, and waited for even if the run is stopped meanwhile: an interrupted run has a log, too."""
         try:
             with tempfile.NamedTemporaryFile("w", prefix="rt-logger-", suffix=".json") as config:
-                json.dump({**vars(self._plan.provenance), "facts": asdict(self._facts())}, config)
+                about = vars(self._plan.provenance)
+                road = {PREVIEW_NAME: str(self._road)} if self._plan.scenario.controller.present else {}
+                known = {"files": {**about["files"], **road}, "facts": asdict(self._facts())}
+                json.dump({**about, **known}, config)
                 config.flush()
                 command = ["rt_runner.logger", "--bus", bus, "--log", str(self._plan.log), "--config", config.name]
                 logger = self._start("logger", [sys.executable, "-m", *command], self._others)
@@ -122,6 +125,7 @@ class Supervisor:
             faults=scenario.all_faults,
             mk=scenario.timing.mk,
             grace_releases=grace_releases(scenario.timing.grace_s, scenario.estimator.period_s),
+            controller=scenario.controller.name if scenario.controller.present else None,
         )
 
     def _plant_command(self, bus: str) -> list[str]:
