@@ -1,10 +1,47 @@
-"""For all tests: SIGINT as a terminal would have it.
+"""For all tests: which of them want the machine for themselves, one folder of compiled libraries, SIGINT as a terminal.
 
-A shell that starts us in the background makes SIGINT ignored, and every process we start would inherit that: Ctrl-C
-could not be tested.
+Tests of real processes in real time are marked ``alone``, by their place here or by themselves. `tools/run-tests` runs
+them one after the other, and everything else two at a time.
 """
 
+import os
+import shutil
 import signal
+import tempfile
+from pathlib import Path
 
+import pytest
+
+HERE = Path(__file__).resolve().parent
+ALONE = (
+    "browser/", "bus/", "faults/", "timing/",
+    "unit/test_rt_threads.py", "unit/test_rt_grant.py", "unit/test_bench_loop.py", "unit/test_pytest_plugin.py",
+)  # fmt: skip
+
+# A shell that starts us in the background makes SIGINT ignored, and every process we start would inherit that: Ctrl-C
+# could not be tested.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+_libraries = pytest.StashKey[str]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """The estimator's libraries for the nets of the tests are compiled once in a run, whichever worker needs them."""
+    if not hasattr(config, "workerinput") and "RT_LIBEST_FOLDER" not in os.environ:
+        folder = tempfile.mkdtemp(prefix="rt-libest-")
+        config.stash[_libraries] = os.environ["RT_LIBEST_FOLDER"] = folder
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    folder = config.stash.get(_libraries, None)
+    if folder is not None:
+        del os.environ["RT_LIBEST_FOLDER"]
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.relative_to(HERE).as_posix().startswith(ALONE):
+            item.add_marker("alone")

@@ -55,7 +55,7 @@ def recorded_rows(steps: int) -> np.ndarray:
 def build(weights: Path, folder: Path, source: str = "bench_mhe.c") -> Path:
     """Compile a C program of this folder with the core, -O2 as the product is."""
     generated, base, program = compile_library(weights).parent, ROOT / "estimator_c", folder / Path(source).stem
-    command = ["gcc", "-std=c11", "-D_GNU_SOURCE", "-O2", "-g", "-fno-math-errno"]
+    command = ["gcc", "-std=c11", "-D_GNU_SOURCE", "-O2", "-g1", "-fno-math-errno"]
     command += [f"-I{base / 'src'}", f"-I{base / 'src' / 'solver'}", f"-I{generated}"]
     command += [str(ROOT / "tools" / source), *(str(base / source) for source in SOURCES)]
     command += [str(path) for path in sorted(generated.glob("*.c"))] + ["-o", str(program), "-lm"]

@@ -32,7 +32,7 @@ TOOLS = ("arm-none-eabi-gcc", "arm-none-eabi-nm", "arm-none-eabi-size", "qemu-sy
 
 # Same arithmetic on both machines: no fused multiply-add, and no reordering (no -O does any).
 FLAGS = (
-    "-std=c11", "-g", "-ffp-contract=off", "-ffunction-sections", "-fdata-sections",
+    "-std=c11", "-g1", "-ffp-contract=off", "-ffunction-sections", "-fdata-sections",
     "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror",
 )  # fmt: skip
 

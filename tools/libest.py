@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import atexit
 import ctypes as ct
+import fcntl
 import hashlib
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -143,7 +145,10 @@ def _opened(path: Path) -> Lib:
 
 
 def compile_library(weights: Path, flags: tuple[str, ...] = ("-O2",)) -> Path:
-    """Generate the C of `weights` and compile it into a folder of this run; returns the shared library."""
+    """Generate the C of `weights` and compile it into a folder of this run; returns the shared library.
+
+    RT_LIBEST_FOLDER: a folder that several processes of one run share; each library is then compiled once for all.
+    """
     from estimator_c.formulation.generate import generate
 
     sources = [ROOT / "estimator_c" / source for source in SOURCES]
@@ -153,22 +158,38 @@ def compile_library(weights: Path, flags: tuple[str, ...] = ("-O2",)) -> Path:
             f"{missing[0]} is missing: the estimator's library is built from a checkout ('make build' there); "
             "RT_LIBESTIMATOR=FILE.so names a built one"
         )
-    folder = Path(tempfile.gettempdir()) / f"rt-libest-{os.getuid()}-{os.getpid()}"
+    folder = _folder()
     key = hashlib.sha256(weights.read_bytes() + " ".join(flags).encode()).hexdigest()[:16]
     out = folder / key
     library = out / "libestimator.so"
-    if library.exists():
-        return library
+    with (folder / f"{key}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not library.exists():
+            _compile(sources, generate(weights, SETTINGS, out), library, flags)
+    return library
+
+
+def _folder() -> Path:
+    shared = os.environ.get("RT_LIBEST_FOLDER")
+    if shared:
+        return Path(shared)
+    folder = Path(tempfile.gettempdir()) / f"rt-libest-{os.getuid()}-{os.getpid()}"
     if not folder.exists():
+        folder.mkdir(mode=0o700)
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    generated = generate(weights, SETTINGS, out)
+    return folder
+
+
+def _compile(sources: Sequence[Path], generated: Sequence[Path], library: Path, flags: tuple[str, ...]) -> None:
+    """gcc; the library is there whole or not at all."""
+    part, out = library.with_suffix(".part"), library.parent
     base = ROOT / "estimator_c"
-    command = ["gcc", "-std=c11", "-D_GNU_SOURCE", "-g", "-fPIC", "-shared", "-fno-math-errno", *flags]
+    command = ["gcc", "-std=c11", "-D_GNU_SOURCE", "-g1", "-fPIC", "-shared", "-fno-math-errno", *flags]
     command += [f"-I{base / 'src'}", f"-I{base / 'src' / 'solver'}", f"-I{out}"]
     command += [str(source) for source in sources]
-    command += [str(path) for path in generated if path.suffix == ".c"] + ["-o", str(library), "-lm"]
+    command += [str(path) for path in generated if path.suffix == ".c"] + ["-o", str(part), "-lm"]
     subprocess.run(command, check=True, stdout=sys.stderr)
-    return library
+    part.replace(library)
 
 
 class Lib:

@@ -81,7 +81,7 @@ class CCodec:
         )
         sizes = "size_t shim_sizes(int which) { return which ? sizeof(e2e_receiver_t) : sizeof(e2e_sender_t); }\n"
         (folder / "shim.c").write_text(declarations + sizes + "".join(map(_shim, dbc)))
-        include, common = ["-I", gen, "-I", SRC], ["-O1", "-g", "-fPIC", *UNDEFINED]
+        include, common = ["-I", gen, "-I", SRC], ["-O1", "-g1", "-fPIC", *UNDEFINED]
         for source in (SRC / "e2e.c", gen / "drive_e2e.c", folder / "shim.c"):
             gcc(*STRICT, *common, *include, "-c", source, "-o", folder / f"{source.stem}.o")
         gcc("-std=c11", "-w", *common, *include, "-c", gen / "drive.c", "-o", folder / "drive.o")

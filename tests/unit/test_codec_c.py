@@ -115,7 +115,7 @@ def test_a_dbc_with_findings_is_not_generated_from(tmp_path, capsys):
 def test_c_program_under_the_sanitizers(tmp_path):
     """tests/c/test_e2e.c with ASan and UBSan, and our generated file under the strict flags."""
     gen, program = generate(tmp_path / "gen"), tmp_path / "test_e2e"
-    sanitize = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "-g", "-O1"]
+    sanitize = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "-g1", "-O1"]
     include = ["-I", gen, "-I", SRC]
     for source in (ROOT / "tests/c/test_e2e.c", SRC / "e2e.c", gen / "drive_e2e.c"):
         gcc(*STRICT, *sanitize, *include, "-c", source, "-o", tmp_path / f"{source.stem}.o")

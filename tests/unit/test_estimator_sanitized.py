@@ -10,7 +10,7 @@ import pytest
 from tools.libest import ROOT, SOURCES, WEIGHTS, compile_library
 
 BASE = ROOT / "estimator_c"
-SANITIZE = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
+SANITIZE = ["-g1", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
 
 
 @pytest.fixture(scope="module")

@@ -246,7 +246,7 @@ def test_no_undefined_behaviour_in_any_kernel(tmp_path: Path) -> None:
         sources = [ROOT / "tests" / "c" / "test_mhe_kernels.c", *(base / name for name in MHE)]
         sources += [*(base / name for name in SOLVER), *folder.glob("thermal_net*.c"), folder / "est_settings.c"]
         includes = [f"-I{folder}", f"-I{base / 'src'}", f"-I{base / 'src' / 'solver'}"]
-        sanitize = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
+        sanitize = ["-g1", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
         program = folder / "drive"
         strict = ["-std=c11", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror"]
         subprocess.run(["gcc", *strict, *sanitize, *includes, *map(str, sources), "-o", str(program)], check=True)

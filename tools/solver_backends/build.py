@@ -25,7 +25,7 @@ class BuildError(Exception):
 def build_runner(folder: Path) -> Path:
     """bench_solver."""
     program = folder / "bench_solver"
-    _gcc(["-O2", "-g", *STRICT, f"-I{TOOLS}", str(TOOLS / "bench_solver.c"), "-o", str(program), "-ldl"])
+    _gcc(["-O2", "-g1", *STRICT, f"-I{TOOLS}", str(TOOLS / "bench_solver.c"), "-o", str(program), "-ldl"])
     return program
 
 
@@ -38,7 +38,7 @@ def build_mhe(weights: Path, folder: Path, real: Real = DOUBLE) -> Path:
     sources += [*sorted(base.glob("mhe*.c")), *sorted((base / "solver").glob("*.c"))]
     sources.append(HERE / "mhe_backend.c")
     _gcc([
-        "-O2", "-g", "-fPIC", "-shared", "-fno-math-errno", "-Wall", "-Wextra", "-Werror",
+        "-O2", "-g1", "-fPIC", "-shared", "-fno-math-errno", "-Wall", "-Wextra", "-Werror",
         f"-I{base}", f"-I{base / 'solver'}", f"-I{generated}", f"-I{HERE}", *map(str, sources),
         "-o", str(library), "-lm",
     ])  # fmt: skip
@@ -64,7 +64,7 @@ def build_hpipm(weights: Path, folder: Path) -> Path:
     for source, flags in ((model, ("-w",)), (HERE / "hpipm_qp.c", STRICT), (HERE / "hpipm_backend.c", STRICT)):
         objects.append(folder / f"{source.stem}.o")
         _gcc([
-            "-O2", "-g", "-fPIC", "-fno-math-errno", *flags, f"-I{folder}", f"-I{HERE}", f"-I{generated}",
+            "-O2", "-g1", "-fPIC", "-fno-math-errno", *flags, f"-I{folder}", f"-I{HERE}", f"-I{generated}",
             "-isystem", str(wheel / "include"), "-c", str(source), "-o", str(objects[-1]),
         ])  # fmt: skip
     _gcc([
