@@ -24,9 +24,10 @@ def derive(jobs: Jobs, deadline_ns: int) -> None:
     t["preempt"] = _from(lambda wall, cpu: max(0, wall - cpu), t["exec_wall"], t["exec_cpu"])
     if jobs.has("wake_lat"):
         t["publish"] = _from(lambda resp, wake, wall: resp - wake - wall, t["resp"], t["wake_lat"], t["exec_wall"])
-    else:  # lock-step: the response counts from the start
+        t["slack"] = _from(lambda resp: deadline_ns - resp, t["resp"])
+    else:  # lock-step: the response counts from the start, and nothing can be late
         t["publish"] = _from(lambda resp, wall: resp - wall, t["resp"], t["exec_wall"])
-    t["slack"] = _from(lambda resp: deadline_ns - resp, t["resp"])
+        t["slack"] = array("q", [NO_NS]) * len(t["resp"])
     # start = release + wake, and releases lie on the grid: what is left of the starts' distance are the wake latencies.
     wake = t["wake_lat"]
     t["period_dev"] = array("q", [NO_NS]) * len(wake)

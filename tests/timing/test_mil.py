@@ -28,6 +28,11 @@ def test_the_whole_lap_passes(tmp_path):
     inspected = rt_runner("inspect", tmp_path / "lap.mcap")
     assert inspected.returncode == 0, inspected.stderr
     assert "recomputed from the frames: the same result" in inspected.stdout
+    timed = rt_runner("timing", tmp_path / "lap.mcap", "--json", tmp_path / "timing.json")
+    assert timed.returncode == 0, timed.stdout + timed.stderr
+    figures = load_result(tmp_path / "timing.json")
+    assert {c["name"]: c["ok"] for c in figures["audit"]["checks"]}["histograms"] is True
+    assert figures["estimator"]["windows"]["since_start"]["slack"]["count"] == 0
 
 
 @pytest.mark.parametrize("period", [0.1, 0.01])
