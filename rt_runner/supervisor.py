@@ -22,6 +22,7 @@ from rt_runner.timing_config import grace_releases, timing_options
 LOGGER_READY_S = 30.0
 READY_S = 90.0  # the plant compiles its kernel at first use and drives to the scenario's start
 ESTIMATOR_DRAIN_S = 0.25
+WORKER_END_S = 12.0  # on a bus that lags behind the estimator leaves only when all it sent is on it
 STOPPED_BY_MISSES = 2  # how the estimator ends when its policy stops it
 RESTARTS_MAX = 3  # of one process, where a controller closes the loop; without one, a process that ends fails the run
 
@@ -267,7 +268,7 @@ class Supervisor:
         return "misses" if any(f.get("stopped_by") == "misses" for f in self._finals.values()) else "end"
 
     def _end(self, child: Child) -> None:
-        status = child.stop()
+        status = child.stop(WORKER_END_S)
         if status not in (0, -15) and not (status == STOPPED_BY_MISSES and child in self._workers.values()):
             raise ChildError(child.obituary())
 

@@ -23,6 +23,8 @@
 
 enum { MIN_PERIOD_US = 1000, MAX_PERIOD_US = 1000000, DEFAULT_PERIOD_US = 100000, DEFAULT_PRIORITY = 80, MAX_CORE = 1023 };
 enum { MIN_WARMUP_RELEASES = 5, US_PER_S = 1000000, MAX_GRACE = 1000000 };
+static const int64_t FLUSH_NS = INT64_C(8000000000); /* the supervisor gives us twelve seconds to end */
+
 enum { EXIT_TIMING = 2 }; /* the policy stopped it: too many misses */
 
 typedef struct {
@@ -395,6 +397,9 @@ static int conclude(est_report_run *run, est_cycle_status status) {
     const bool stopped = status == EST_CYCLE_STOPPED;
     if (status != EST_CYCLE_GONE) {
         status = est_cycle_send_final(&cycle);
+    }
+    if (status == EST_CYCLE_OK) {
+        (void)est_port_flush(&port_state, FLUSH_NS); /* in vain where nobody reads: then the log shows what is missing */
     }
     rt_environment_read(&run->end, true);
     run->stopped_by = status == EST_CYCLE_GONE ? "bus" : stopped ? "misses" : run->stopped_by;

@@ -1,8 +1,10 @@
 #include "est_port.h"
 
 #include <errno.h>
+#include <linux/sockios.h>
 #include <poll.h>
 #include <stddef.h>
+#include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <time.h>
 
@@ -16,6 +18,7 @@ enum {
 };
 
 static const int64_t NS_PER_S = 1000000000;
+static const int64_t FLUSH_LOOK_NS = 1000000;
 
 _Static_assert((int)CAN_PORT_SKIP_MAX == (int)EST_IO_SKIP_COST, "a skip costs what the cycle takes it to cost");
 
@@ -117,6 +120,20 @@ est_io est_port_io(est_port *self, can_port_t *port) {
     }
     const est_io io = {self, begin, receive, transmit, counters, wait_until};
     return io;
+}
+
+bool est_port_flush(const est_port *self, int64_t limit_ns) {
+    const rt_clock clock = rt_clock_system();
+    const int64_t until_ns = clock.now_ns(clock.ctx) + limit_ns;
+    int left_bytes = 0;
+    while (self->port->hub && ioctl(self->port->fd, SIOCOUTQ, &left_bytes) == 0 && left_bytes > 0) {
+        const int64_t now_ns = clock.now_ns(clock.ctx);
+        if (now_ns >= until_ns) {
+            return false;
+        }
+        (void)clock.sleep_until_ns(clock.ctx, now_ns + FLUSH_LOOK_NS);
+    }
+    return true;
 }
 
 int est_port_short_of(const est_port *self, int64_t period_us) {

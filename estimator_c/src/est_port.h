@@ -25,6 +25,10 @@ typedef struct {
  * cycle ignores foreign ids itself. */
 est_io est_port_io(est_port *self, can_port_t *port);
 
+/* Hub, after the loop: waits until the hub has taken every frame sent, `limit_ns` at most, so that who is told that we have
+ * ended finds all of them on the bus. False: some are still waiting. SocketCAN has no such queue of ours: true at once. */
+bool est_port_flush(const est_port *self, int64_t limit_ns);
+
 /* Bytes that the send buffer lacks to hold a second of frames at this period; 0: enough, or no matter (SocketCAN). O(1). */
 int est_port_short_of(const est_port *self, int64_t period_us);
 

@@ -199,7 +199,29 @@ static void a_second_of_frames_fits_where_it_is_said_to(void) {
     disconnect_port();
 }
 
+/* What the other side has not read yet is waited for, but not for ever. */
+static void a_flush_ends_when_all_is_read_or_at_its_limit(void) {
+    connect_port();
+    const struct canfd_frame frame = {.can_id = 1, .len = 8};
+    struct can_frame read_here;
+    CHECK(est_port_flush(&state, 0));
+    for (int i = 0; i < 3; i++) {
+        CHECK(io.send(io.ctx, &frame) == EST_IO_OK);
+    }
+    const int64_t before = now_ns();
+    CHECK(!est_port_flush(&state, 20 * (int64_t)MS));
+    CHECK(now_ns() - before >= 20 * (int64_t)MS);
+    while (recv(hub, &read_here, sizeof read_here, 0) == sizeof read_here) {
+    }
+    CHECK(est_port_flush(&state, 0));
+    CHECK(io.send(io.ctx, &frame) == EST_IO_OK);
+    port.hub = false; /* a CAN interface keeps its own queue */
+    CHECK(est_port_flush(&state, 0));
+    disconnect_port();
+}
+
 int main(void) {
+    a_flush_ends_when_all_is_read_or_at_its_limit();
     a_frame_the_port_refuses_is_counted_as_lost();
     a_second_of_frames_fits_where_it_is_said_to();
     arrival_is_right_even_if_the_job_was_held_up();

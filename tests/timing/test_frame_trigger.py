@@ -8,8 +8,9 @@ import can
 import pytest
 
 from rt_runner.bus import HubProcess, open_bus
-from tests.timing.estimator_process import DBC, OnBus, Plant, binary, lap, per_job
+from tests.timing.estimator_process import DBC, OnBus, Plant, Run, binary, per_job
 
+TRIES, LATE_MAX_S = 4, 0.05
 TEMP_ID = DBC["TempMeas"].frame_id
 TIMEOUT_S = DBC["TempMeas"].timeout_ms / 1000
 FIRST, QUIET_S, SECOND = range(1, 151), 0.75, range(151, 252)  # ticks sent, silence, ticks sent
@@ -19,6 +20,8 @@ SILENT_S = QUIET_S + 0.1  # between the last TempMeas before and the first after
 class Scripted(OnBus):
     """The plant of `OnBus`, silent until told to send."""
 
+    late_s = 0.0  # how late it was itself at most
+
     def _send(self) -> None:
         return
 
@@ -26,17 +29,17 @@ class Scripted(OnBus):
         """Send these ticks in real time; the ticks of the temperature frames among them."""
         start, temps = time.monotonic(), []
         for n, tick in enumerate(ticks):
-            time.sleep(max(0.0, start + n * 0.01 - time.monotonic()))
+            ahead_s = start + n * 0.01 - time.monotonic()
+            self.late_s = max(self.late_s, -ahead_s)
+            time.sleep(max(0.0, ahead_s))
             for can_id, data in plant.frames(tick):
                 self.send(can_id, data)
                 temps += [tick] if can_id == TEMP_ID else []
         return temps
 
 
-@pytest.fixture(scope="module")
-def run():
-    """Fifteen frames, silence, ten frames: what came of them, and the ticks of the frames."""
-    lap()  # computed before the clock runs
+def scripted_run() -> tuple[Run, list[int], float]:
+    """Fifteen frames, silence, ten frames: what came of them, the ticks of the frames, by how much anybody was late."""
     hub = HubProcess()
     try:
         talk = Scripted(hub.bus, binary("release"), "--trigger", "frame", "--grace-releases", "0")
@@ -45,9 +48,21 @@ def run():
         time.sleep(QUIET_S)
         temps += talk.drive(plant, SECOND)
         time.sleep(0.05)
-        yield talk.finish(), temps
+        result = talk.finish()
     finally:
         hub.stop()
+    assert result.final is not None
+    return result, temps, max(talk.late_s, result.final["wake_lat_us"]["max"] * 1e-6)
+
+
+@pytest.fixture(scope="module")
+def run():
+    """A run in which nobody was held up: what the machine does to us is not the question here."""
+    for _ in range(TRIES):
+        result, temps, late_s = scripted_run()
+        if late_s < LATE_MAX_S:
+            return result, temps
+    pytest.fail(f"in {TRIES} runs the machine never left us alone for four seconds")
 
 
 def stale(job) -> bool:
