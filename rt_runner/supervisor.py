@@ -196,6 +196,8 @@ class Supervisor:
     def _controller_command(self, bus: str) -> list[str]:
         how = ["--bus", bus, "--core", str(self._controller_core)]
         how += [] if self._plan.realtime else ["--no-rt"]
+        # The estimator is above it: on the estimator's core a late canary would not be the machine's doing.
+        how += ["--no-canary"] if self._controller_core == self._core else []
         return controller_command(self._plan.scenario.controller, self._road, how)
 
     def _estimator_command(self, bus: str) -> list[str]:

@@ -17,8 +17,10 @@
 #include "ctl_report.h"
 #include "est_lockstep.h"
 #include "est_port.h"
+#include "rt_canary.h"
 #include "rt_clock.h"
 #include "rt_grant.h"
+#include "rt_machine.h"
 #include "thermal_net.h"
 
 enum { DEFAULT_PERIOD_US = 100000, DEFAULT_PRIORITY = 79, MAX_CORE = 1023 };
@@ -34,6 +36,7 @@ typedef struct {
     uint8_t controller; /* of controller_names */
     int64_t period_us;
     rt_request request;
+    bool canary;
     bool lockstep;
     bool replay; /* lock-step where the records say which job ran when */
 } options;
@@ -45,6 +48,8 @@ static ctl_cycle cycle;
 static ctl_preview preview;
 static est_lockstep lockstep;
 static est_port port_state;
+static rt_canary canary;
+static rt_machine machine;
 static can_port_t port;
 static volatile sig_atomic_t stop_requested;
 
@@ -74,7 +79,7 @@ static bool was_written(const char *what) {
 
 static void usage(FILE *out) {
     (void)fputs("usage: rt_controller --bus socketcan:IFACE|rt_hub:PATH --preview FILE [--controller NAME] [--core N]\n"
-                "                     [--period-us 10000|20000|50000|100000] [--priority 1..99] [--no-rt]\n"
+                "                     [--period-us 10000|20000|50000|100000] [--priority 1..99] [--no-rt] [--no-canary]\n"
                 "       rt_controller --lockstep --preview FILE [--controller NAME] …   records on stdin and stdout\n"
                 "       rt_controller --replay   --preview FILE [--controller NAME] …   they say when jobs ran\n"
                 "controllers: none, rule-150-155, rule-145-160, mpc-S, mpc-M (default), paper\n",
@@ -134,6 +139,7 @@ static int check(options *opt, int argc, char **argv, const char *name) {
     }
     if (opt->lockstep) {
         opt->request.real_time = false; /* it waits for its input, not for a clock */
+        opt->canary = false;
     }
     return find_controller(name, &opt->controller);
 }
@@ -144,13 +150,15 @@ static int parse(int argc, char **argv, options *opt) {
         {"bus", required_argument, NULL, 'b'},       {"preview", required_argument, NULL, 'v'},
         {"controller", required_argument, NULL, 'k'}, {"period-us", required_argument, NULL, 't'},
         {"core", required_argument, NULL, 'c'},      {"priority", required_argument, NULL, 'p'},
-        {"no-rt", no_argument, NULL, 'n'},           {"lockstep", no_argument, NULL, 'l'},
+        {"no-rt", no_argument, NULL, 'n'},
+        {"canary", no_argument, NULL, 'C'},          {"no-canary", no_argument, NULL, 'N'},
+        {"lockstep", no_argument, NULL, 'l'},
         {"replay", no_argument, NULL, 'r'},          {"help", no_argument, NULL, 'h'},
         {NULL, 0, NULL, 0},
     };
     const char *name = "mpc-M";
     int choice = 0, exit_status = -1;
-    *opt = (options){.period_us = DEFAULT_PERIOD_US, .request = {-1, DEFAULT_PRIORITY, true}};
+    *opt = (options){.period_us = DEFAULT_PERIOD_US, .request = {-1, DEFAULT_PRIORITY, true}, .canary = true};
     opterr = 0;
     while (exit_status == -1 && (choice = getopt_long(argc, argv, "", table, NULL)) != -1) {
         switch (choice) {
@@ -170,6 +178,10 @@ static int parse(int argc, char **argv, options *opt) {
             break;
         case 'n':
             opt->request.real_time = false;
+            break;
+        case 'C':
+        case 'N':
+            opt->canary = choice == 'C';
             break;
         case 'r':
             opt->replay = true;
@@ -257,6 +269,22 @@ static void listen_to_ours(void) {
     (void)can_port_filter(&port, wanted, CTL_RX_COUNT); /* without it the cycle ignores foreign ids itself */
 }
 
+static void start_helpers(const options *opt, rt_granted *granted) {
+    if (opt->canary) {
+        rt_canary_start(&canary, opt->period_us * 1000, granted);
+    }
+    if (canary.running) {
+        rt_task_set_canary(&cycle.task, &canary.ring, canary.conclusive);
+    }
+    rt_machine_start(&machine, granted->core, (int64_t)US_PER_S * 1000);
+    ctl_cycle_watch(&cycle, &machine);
+}
+
+static void stop_helpers(void) {
+    rt_canary_stop(&canary);
+    rt_machine_stop(&machine);
+}
+
 static int run_on_bus(const options *opt) {
     rt_granted granted;
     ctl_report_run run = {.stopped_by = "signal"};
@@ -273,13 +301,18 @@ static int run_on_bus(const options *opt) {
         can_port_close(&port);
         return refused;
     }
+    start_helpers(opt, &granted);
     report_ready(stdout, opt, &granted);
     if (!was_written("ready")) {
+        stop_helpers();
         can_port_close(&port);
         return EXIT_FAILURE;
     }
     rt_environment_read(&run.start, true);
     ctl_cycle_start_grid(&cycle);
+    if (canary.running) {
+        rt_canary_aim(&canary, cycle.task.config.t0_ns);
+    }
 
     ctl_cycle_status status = CTL_CYCLE_OK;
     while (stop_requested == 0 && status != CTL_CYCLE_GONE) {
@@ -290,6 +323,7 @@ static int run_on_bus(const options *opt) {
         }
     }
 
+    stop_helpers(); /* before the figures: nobody writes what they are made of */
     rt_environment_read(&run.end, true);
     if (status != CTL_CYCLE_GONE) {
         status = ctl_cycle_send_final(&cycle);

@@ -158,49 +158,19 @@ static ctl_cycle_status publish_timing(ctl_cycle *self, const rt_job *job, bool 
     return send_all(self, frames, TIMING_JOB_FRAMES);
 }
 
-static timing_stat stat_of(const rt_stats *stats) {
-    enum { P99 = 9900 };
-    timing_stat out = {TIMING_NA, stats->count > 0 ? stats->max_ns : TIMING_NA};
-    if (rt_stats_quantile(stats, P99, &out.p99_ns) == RT_QUANTILE_NA) {
-        out.p99_ns = TIMING_NA;
-    }
-    return out;
-}
-
-static timing_counters timing_of(const ctl_cycle *self) {
-    const rt_tally *tally = &self->task.total;
-    const rt_stats *stats = self->task.stats;
-    const timing_counters out = {
-        .releases = tally->releases,
-        .jobs = tally->jobs,
-        .miss_late = tally->miss_late,
-        .miss_skipped = tally->miss_skipped,
-        .overrun = tally->overrun,
-        .waiting = tally->queued_now,
-        .queued = tally->queued,
-        .cut = self->task.cut_jobs,
-        .rebased = self->task.rebased,
-        .phase_ns = self->task.phase_ns,
-        .consec_miss_max = tally->consec_miss_max,
-        .mk_worst = tally->mk_worst,
-        .run_delay_ns = TIMING_NA,
-        .steal_ns = TIMING_NA,
-        .migrations = self->task.migrations,
-        .canary = {TIMING_NA, TIMING_NA},
-        .wake = stat_of(&stats[RT_METRIC_WAKE_LAT]),
-        .exec = stat_of(&stats[RT_METRIC_EXEC_WALL]),
-        .resp = stat_of(&stats[RT_METRIC_RESP]),
-    };
-    return out;
+void ctl_cycle_watch(ctl_cycle *self, const rt_machine *machine) {
+    self->watch.machine = machine;
 }
 
 void ctl_cycle_counters(const ctl_cycle *self, ctl_counters *out) {
     ctl_bus_faults faults;
     est_io_counters io;
+    timing_counters timing;
     ctl_bus_read_faults(&self->bus, &faults);
+    timing_watch_counters(&self->watch, &self->task, &timing);
     self->io.counters(self->io.ctx, &io);
     *out = (ctl_counters){
-        .timing = timing_of(self),
+        .timing = timing,
         .crc_errors = faults.crc_errors,
         .seq_errors = faults.seq_errors,
         .stale_inputs = self->stale_jobs,
@@ -277,6 +247,7 @@ static ctl_cycle_status run(ctl_cycle *self, rt_job *job, int64_t now_ns) {
     if (status == CTL_CYCLE_OK) {
         status = publish_timing(self, job, stale, now_ns);
     }
+    timing_watch_job(&self->watch, job);
     if (status == CTL_CYCLE_OK) {
         status = housekeeping(self, job);
     }

@@ -17,7 +17,9 @@
 #include "controller.h"
 #include "ctl_bus.h"
 #include "est_io.h"
+#include "rt_machine.h"
 #include "rt_task.h"
+#include "timing_watch.h"
 
 enum {
     CTL_CYCLE_MAX_FRAMES = 4096, /* frames one job reads at most; the rest waits for the next job */
@@ -48,6 +50,7 @@ typedef struct {
     int64_t next_identity_ns;
     ctl_counters round;          /* counters of the housekeeping round under way */
     size_t round_next, round_end;
+    timing_watch watch;          /* what the kernel says since warm-up */
     uint64_t stale_jobs, mute_jobs;
     uint64_t commands_sent, commands_lost; /* jobs = sent + lost */
     uint64_t sources[4];         /* jobs by controller_source_t */
@@ -58,6 +61,9 @@ typedef struct {
  * Milliseconds. */
 ctl_cycle_status ctl_cycle_init(ctl_cycle *self, const rt_task_config *config, const rt_clock *clock, const char *name,
                                 const controller_road_t *road, const est_io *io, const ctl_identity *identity);
+
+/* Run delay and steal time are read from `machine`, which outlives `self`. */
+void ctl_cycle_watch(ctl_cycle *self, const rt_machine *machine);
 
 /* Real time: the grid starts now (r_0). Once, before the first job. */
 void ctl_cycle_start_grid(ctl_cycle *self);

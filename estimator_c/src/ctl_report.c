@@ -2,6 +2,8 @@
 
 #include <inttypes.h>
 
+#include "rt_report.h"
+
 static const char *boolean(bool value) {
     return value ? "true" : "false";
 }
@@ -121,6 +123,8 @@ void ctl_report_final(FILE *out, const ctl_cycle *cycle, const ctl_report_run *r
         (void)fprintf(out, ",\"faults\":{\"minor\":%" PRId64 ",\"major\":%" PRId64 "}",
                       run->end.minor_faults - run->warm.minor_faults, run->end.major_faults - run->warm.major_faults);
     }
-    (void)fprintf(out, ",\"invol_switches\":%" PRId64 "}\n", run->end.invol_switches - run->start.invol_switches);
+    (void)fprintf(out, ",\"invol_switches\":%" PRId64, run->end.invol_switches - run->start.invol_switches);
+    rt_report_histograms(out, &cycle->task);
+    (void)fputs("}\n", out);
     (void)fflush(out);
 }

@@ -30,7 +30,8 @@ typedef struct {
 /* {"ready":true,"policy":…,"warnings":[…]} and a newline, flushed. */
 void ctl_report_ready(FILE *out, const ctl_report_identity *identity);
 
-/* {"final":true,"jobs":…} and a newline, flushed. Times in µs, after warm-up; null where there are too few samples. */
+/* {"final":true,"jobs":…} and a newline, flushed. Times in µs, after warm-up; null where there are too few samples.
+ * "histograms" as in rt_report.h. */
 void ctl_report_final(FILE *out, const ctl_cycle *cycle, const ctl_report_run *run);
 
 #endif

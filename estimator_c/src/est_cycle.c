@@ -61,7 +61,7 @@ void est_cycle_inject(est_cycle *self, const injections *faults) {
 }
 
 void est_cycle_watch(est_cycle *self, const rt_machine *machine) {
-    self->machine = machine;
+    self->watch.machine = machine;
 }
 
 static int64_t now_of(const est_cycle *self) {
@@ -306,7 +306,7 @@ static est_cycle_status run(est_cycle *self, rt_job *job, int64_t now_ns, est_cy
     if (status == EST_CYCLE_OK) {
         status = publish_timing(self, job, put_out, stale, now_ns);
     }
-    est_housekeeping_note_warm(self, job);
+    timing_watch_job(&self->watch, job);
     if (status == EST_CYCLE_OK) {
         status = est_housekeeping(self, job);
     }

@@ -19,9 +19,9 @@
 #include "est_io.h"
 #include "estimator.h"
 #include "injection.h"
-#include "rt_grant.h"
 #include "rt_machine.h"
 #include "rt_task.h"
+#include "timing_watch.h"
 
 enum { EST_CYCLE_MAX_FRAMES = 4096 }; /* frames one job reads at most; the rest waits for the next job */
 
@@ -76,11 +76,7 @@ typedef struct {
     int64_t last_release_ns;    /* of the newest job */
     int64_t event_ns;           /* trigger by frames: arrival of the frame that waits for its job; -1: none */
     int64_t event_due_ns;       /* … and when a job runs without one */
-    const rt_machine *machine;  /* NULL: none */
-    rt_environment warm;        /* at the first job after warm-up */
-    int64_t warm_run_delay_ns;
-    int64_t warm_steal_ns;
-    bool warm_known;
+    timing_watch watch;         /* what the kernel says since warm-up */
     uint64_t stale_jobs;        /* jobs made without fresh input */
     uint64_t estimates_sent;    /* jobs = estimates_sent + estimates_lost */
     uint64_t estimates_lost;

@@ -13,9 +13,6 @@ void est_housekeeping_set_due(est_cycle *self, int64_t t0_ns);
  * Some µs, at the beginning of a round some ten. */
 est_cycle_status est_housekeeping(est_cycle *self, const rt_job *job);
 
-/* Takes note of the kernel's figures at the first job that is judged: what is published counts from there. About 1 µs, once. */
-void est_housekeeping_note_warm(est_cycle *self, const rt_job *job);
-
 /* Sends `count` frames; a full bus loses a frame (counted by the port), a bus that has ended ends the cycle. */
 est_cycle_status est_housekeeping_send(est_cycle *self, const struct canfd_frame *frames, size_t count);
 

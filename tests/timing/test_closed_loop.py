@@ -14,6 +14,7 @@ import pytest
 
 from plant_sim.driver import TorqueCommand
 from plant_sim.faults import parse_fault
+from plant_sim.preview import fingerprint24
 from plant_sim.state import ROW_THETA_W
 from rt_runner import paths
 from rt_runner.codec import Decoder
@@ -230,11 +231,32 @@ def inputs(log: Log):
             yield DBC[name].frame_id, t_ns, data
 
 
+def speaks_for_itself(path: Path) -> None:
+    """The log has the controller's road and its last line, and the latter holds every value of its frames."""
+    reader, log = LogReader(path), Log(path)
+    road = reader.attachments["preview.txt"]
+    assert log.column("CtlBuild", "preview_hash")[-1] == fingerprint24(road)
+    final = json.loads(reader.attachments["controller_final.json"])
+    jobs = log.column("CtlTimingA", "warmup")
+    for window, count in (("warmup", sum(map(bool, jobs))), ("judged", len(jobs) - sum(map(bool, jobs)))):
+        told = final["histograms"][window]["resp_us"]
+        assert told["count"] == count > 0
+        assert told["underflow"] + told["overflow"] + sum(n for _, _, n in told["buckets"]) == count
+    counted = json.loads(reader.metadata["result"]["json"])["timing"]["controller"]
+    assert (counted["jobs"], counted["releases"]) == (final["jobs"], final["releases"])
+    machine = log.frames["CtlMachine"][-1][1]
+    assert machine["run_delay_ms"] is not None, "the kernel is asked for the controller, too"
+    if len(os.sched_getaffinity(0)) > 1:  # on the estimator's core there is no canary
+        assert log.column("CtlCanary", "canary_max_us")[-1] is not None
+        assert any(v is not None for v in log.column("CtlTimingD", "canary_us"))
+
+
 def test_the_same_frames_give_the_same_commands_bit_for_bit(tmp_path):
     scenario, path = tmp_path / "hot.toml", tmp_path / "live.mcap"
     scenario.write_text(SCENE.replace("26.0", "8.0"))
     done = rt_runner("run", scenario, "--bus", "hub", "--log", path)
     assert done.returncode in (0, 2, 3), done.stderr
+    speaks_for_itself(path)
     log = Log(path)
     count = min(len(log.frames[name]) for name in ("TorqueCommand", "CtlTimingC"))
     in_order = sorted((t, data) for name in SAID for t, _, data in log.frames[name][:count])
@@ -278,8 +300,6 @@ def test_the_process_refuses_in_one_line(tmp_path, args, says):
 
 
 def test_the_road_it_loaded_is_the_one_that_was_written(tmp_path):
-    from plant_sim.preview import fingerprint24
-
     road = tmp_path / "road"
     road.write_text("rt-preview 1\n1.0 3 2.0\n10.0 0.0\n11.0 0.01\n12.0 0.0\n")
     command = [paths.binary("rt_controller"), "--lockstep", "--preview", road, "--controller", "none"]
@@ -288,4 +308,5 @@ def test_the_road_it_loaded_is_the_one_that_was_written(tmp_path):
     assert ready["preview_hash"] == f"{fingerprint24(road.read_bytes()):06x}"
     final = json.loads(done.stderr.splitlines()[-1])
     assert final["releases"] == final["jobs"] + final["miss_skipped"]
+    assert set(final["histograms"]) == {"warmup", "judged"}
 
