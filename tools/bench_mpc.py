@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from plant_sim.driver import TorqueCommand
-from tests.support.libctl import Controller, Lib, load
 from tests.support.mpc_drives import hot_plant
+from tools.libctl import Controller, Lib, load
 
 NAMES = ("none", "rule-150-155", "rule-145-160", "paper", "mpc-S", "mpc-M")
 LIMIT_DEGC, LONGEST_S = 155.0, 1200.0

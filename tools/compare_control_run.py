@@ -22,8 +22,7 @@ from plant_sim.params import load_params
 from plant_sim.plant import Plant
 from plant_sim.state import ROW_SPEED, ROW_THETA_R, ROW_THETA_W, ROW_TORQUE, ROW_V, ROW_V_REF, ROW_X
 from rt_runner.dbc import SignalInfo, load_dbc
-from tests.support import libctl
-from tools import libest
+from tools import libctl, libest
 from tools.estimators.core import SIGMA, STATUS, THETA, UPPER
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ from plant_sim.cycles import CycleSpec
 from plant_sim.driver import TorqueCommand
 from plant_sim.params import load_params
 from plant_sim.plant import Plant
-from tests.support.libctl import INTERVALS, ROOT, Array, Controller, Lib, Out, Problem, load
+from tools.libctl import INTERVALS, ROOT, Array, Controller, Lib, Out, Problem, load
 
 RECORDER = ROOT / "tests" / "support" / "mpc_recorder.c"
 

@@ -14,8 +14,8 @@ from estimator_c.formulation.mpc import MpcOracle, MpcSolution
 from estimator_c.formulation.mpc_settings import load_mpc_settings, load_vehicle
 from estimator_c.formulation.net import build_net
 from estimator_c.formulation.weights import load_weights
-from tests.support.libctl import FAILED, MAX_ITERATIONS, MPC_SETTINGS, OK, WEIGHTS, Memory, Mpc, Result, load
 from tests.support.mpc_drives import Step, recorded
+from tools.libctl import FAILED, MAX_ITERATIONS, MPC_SETTINGS, OK, WEIGHTS, Memory, Mpc, Result, load
 
 KERNELS = ("portable", "avx2", "avx512")
 GATE_NM = 1e-3

@@ -17,7 +17,8 @@ from estimator_c.formulation.weights import load_weights
 from plant_sim.driver import driver_step
 from plant_sim.params import load_params
 from plant_sim.vehicle import motor_speed_rpm, motoring_limit_nm, regen_limit_nm
-from tests.support.libctl import (
+from tests.support.mpc_drives import drive, hot_plant, recorder
+from tools.libctl import (
     BAD_PERIOD,
     BAD_ROAD,
     BASE,
@@ -41,7 +42,6 @@ from tests.support.libctl import (
     compile_library,
     load,
 )  # fmt: skip
-from tests.support.mpc_drives import drive, hot_plant, recorder
 
 ROAD = np.full(3000, 25.0), np.zeros(3000)
 

@@ -1,4 +1,4 @@
-"""ctypes binding of the controller's C: the same functions the controller's process runs, driven from Python."""
+"""ctypes binding of the controller's C: what its process runs, driven from Python, by tools and tests."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator_c.formulation.simd import ISAS, Isa
+from rt_runner import paths
+from rt_runner.errors import SetupError
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 BASE = ROOT / "estimator_c"
 WEIGHTS = BASE / "weights" / "lstm8.json"
 SETTINGS, MPC_SETTINGS = BASE / "settings", BASE / "settings" / "mpc"
@@ -122,10 +124,24 @@ def load(weights: Path = WEIGHTS, flags: tuple[str, ...] = ("-O2",)) -> Lib:
     """The controller's library: build/lib where that is asked for and there, else compiled for this run.
 
     RT_LIBESTIMATOR names another one in its place (an ASan build, say).
+
+    Raises
+    ------
+    SetupError
+        RT_LIBESTIMATOR is no such library, or nothing is built and there are no sources to compile it from.
     """
-    built = Path(os.environ.get("RT_LIBESTIMATOR", ROOT / "build" / "lib" / "libestimator.so"))
-    plain = weights == WEIGHTS and flags == ("-O2",)
-    return Lib(built if plain and built.exists() else compile_library(weights, flags))
+    if weights != WEIGHTS or flags != ("-O2",):
+        return Lib(compile_library(weights, flags))
+    named = os.environ.get("RT_LIBESTIMATOR")
+    built = Path(named) if named else paths.build_dir() / "lib" / "libestimator.so"
+    if not named and not built.exists():
+        return Lib(compile_library(weights, flags))
+    try:
+        return Lib(built)
+    except (OSError, AttributeError, ValueError) as error:
+        raise SetupError(
+            f"{built} is no library of this controller ({error}): run 'make build', or mend RT_LIBESTIMATOR"
+        ) from None
 
 
 def compile_library(weights: Path = WEIGHTS, flags: tuple[str, ...] = ("-O2",), isas: tuple[Isa, ...] = ISAS) -> Path:
@@ -133,6 +149,13 @@ def compile_library(weights: Path = WEIGHTS, flags: tuple[str, ...] = ("-O2",), 
     from estimator_c.formulation.generate import generate
     from estimator_c.formulation.mpc_net import generate_mpc
 
+    sources = [BASE / "src" / f"{name}.c" for name in SOURCES]
+    missing = [path for path in (weights, MPC_SETTINGS, *sources) if not path.exists()]
+    if missing:
+        raise SetupError(
+            f"{missing[0]} is missing: the controller's library is built from a checkout ('make build' there); "
+            "RT_LIBESTIMATOR=FILE.so names a built one"
+        )
     folder = Path(tempfile.gettempdir()) / f"rt-libctl-{os.getuid()}-{os.getpid()}"
     key = hashlib.sha256(weights.read_bytes() + repr((flags, isas)).encode()).hexdigest()[:16]
     out = folder / key
@@ -144,7 +167,7 @@ def compile_library(weights: Path = WEIGHTS, flags: tuple[str, ...] = ("-O2",), 
     generated = [p for p in generate(weights, SETTINGS, out, isas=isas) if p.name.startswith("thermal_net")]
     generated += generate_mpc(weights, MPC_SETTINGS, out, isas)
     command = ["gcc", "-std=c11", "-D_GNU_SOURCE", "-g", "-fPIC", "-shared", *flags, f"-I{BASE / 'src'}", f"-I{out}"]
-    command += [str(BASE / "src" / f"{name}.c") for name in SOURCES]
+    command += [str(path) for path in sources]
     command += [str(path) for path in generated if path.suffix == ".c"] + ["-o", str(library), "-lm"]
     subprocess.run(command, check=True, stdout=sys.stderr)
     return library
