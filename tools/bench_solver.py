@@ -106,7 +106,7 @@ def bench(
         say("instructions …")
         for at, place in enumerate(places[1:], start=1):
             figures[at]["instructions"] = machine.count(place, segments)
-            if machine.configs[place].library != HPIPM:
+            if machine.configs[place].build != HPIPM:
                 figures[at]["instructions_mhe"] = machine.count(place, segments, MHE_PARTS)
     found = by_name(ran[1:], figures[1:])
     if with_oracle and took_us:

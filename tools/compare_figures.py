@@ -14,14 +14,14 @@ from tools.compare_cases import CHANNELS, Variant
 from tools.compare_drives import Lap, drive_lap, sense
 from tools.estimators.drive import run_each
 from tools.estimators.registry import make
-from tools.plots import save
+from tools.plots import outline, save
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Array = NDArray[np.float64]
 SEED = 0
-POINTS = 800  # of a line: more are not seen and make the file large
+POINTS = 500  # of a line: more are not seen and make the file large
 TRUTH, RAW = "#000000", "#b8b8b8"
 # Okabe and Ito's colours, told apart with any colour vision; dashes help where lines lie together.
 STYLES: dict[str, dict[str, Any]] = {
@@ -95,15 +95,19 @@ def _draw(path: Path, view: View, lap: Lap, column: int, raw: Array, found: dict
     figure = Figure(figsize=(10.0, 6.6), layout="constrained", dpi=110)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     rows = np.flatnonzero((lap.t_s >= view.from_s) & (lap.t_s <= view.to_s))
-    rows = rows[:: -(-len(rows) // POINTS)]
     t_s, truth = lap.t_s[rows], lap.truth_degc[rows, column]
-    upper.plot(t_s, raw[rows], color=RAW, lw=0.7, label="raw sensor", zorder=1)
-    lower.plot(t_s, raw[rows] - truth, color=RAW, lw=0.5, zorder=1)
+
+    def line(ax: Axes, y: Array, **style: Any) -> None:
+        shown = outline(y, POINTS)
+        ax.plot(t_s[shown], y[shown], **style)
+
+    line(upper, raw[rows], color=RAW, lw=0.7, label="raw sensor", zorder=1)
+    line(lower, raw[rows] - truth, color=RAW, lw=0.5, zorder=1)
     for key, theta in found.items():
         style = {"zorder": 4, **STYLES.get(key, OTHER)}
-        upper.plot(t_s, theta[rows], label=key, **style)
-        lower.plot(t_s, theta[rows] - truth, **style)
-    upper.plot(t_s, truth, color=TRUTH, lw=0.9, label="truth", zorder=7)
+        line(upper, theta[rows], label=key, **style)
+        line(lower, theta[rows] - truth, **style)
+    line(upper, truth, color=TRUTH, lw=0.9, label="truth", zorder=7)
     lower.axhline(0.0, color=TRUTH, lw=0.8, zorder=5)
     if view.theta_degc is not None:
         upper.set_ylim(*view.theta_degc)

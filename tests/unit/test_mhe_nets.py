@@ -10,6 +10,7 @@ import pytest
 
 from estimator_c.formulation.mhe import MheOracle
 from estimator_c.formulation.weights import NetWeights, load_weights
+from tests.support.mhe_checks import equals_oracle
 from tests.support.nets import random_net
 from tools.bench_net import cost_of
 from tools.libest import Estimator, Lib, compile_library
@@ -36,15 +37,7 @@ def test_mhe_equals_ipopt(net: tuple[str, Path, NetWeights, Lib]) -> None:
     asked = FEW.get(name, STEPS)
     oracle = MheOracle(weights)
     run = Recorder(lib, weights, lib.setting("default", tolerance_degc=1e-9, max_sweeps=60, loss=0), record(weights))
-    for step in range(max(asked) + 1):
-        if step > 0:
-            run.advance()
-        problem = run.problem()
-        status, result = run.mhe.solve()
-        assert status == 0, f"step {step}: {result.sweeps} sweeps left {result.kkt_degc} degC"
-        if step in asked:
-            expected = oracle.solve(problem)
-            np.testing.assert_allclose(run.mhe.theta(), expected, rtol=0, atol=AGREEMENT_DEGC, err_msg=f"step {step}")
+    equals_oracle(run, oracle, asked, AGREEMENT_DEGC)
 
 
 def test_core_follows_a_drive_of_its_own_net(net: tuple[str, Path, NetWeights, Lib]) -> None:

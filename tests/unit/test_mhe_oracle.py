@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from estimator_c.formulation.lstm_numpy import lstm_step
 from estimator_c.formulation.mhe import MheOracle
 from estimator_c.formulation.weights import NetWeights, load_weights
+from tests.support.mhe_checks import equals_oracle
 from tools.libest import NODES, WEIGHTS, Lib, Mhe, compile_library
 from tools.mhe_recorder import Record, Recorder, record
 
@@ -69,18 +70,7 @@ def recorder(name: str, **extra: float) -> Recorder:
 @pytest.mark.parametrize("name", CASES)
 def test_equals_ipopt(name: str) -> None:
     run = recorder(name)
-    active, checked = 0, 0
-    for step in range(max(STEPS) + 1):
-        if step > 0:
-            run.advance()
-        problem = run.problem()
-        status, result = run.mhe.solve()
-        assert status == 0, f"step {step}: {result.sweeps} sweeps left {result.kkt_degc} degC"
-        if step in STEPS:
-            expected = oracle("theta").solve(problem)
-            np.testing.assert_allclose(run.mhe.theta(), expected, rtol=0, atol=AGREEMENT_DEGC, err_msg=f"step {step}")
-            active, checked = active + result.active, checked + 1
-    assert checked == len(STEPS)
+    active = equals_oracle(run, oracle("theta"), STEPS, AGREEMENT_DEGC)
     assert (active > 0) == ("met" in name)
 
 

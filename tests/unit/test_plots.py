@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from pathlib import Path
@@ -98,3 +99,32 @@ def test_a_plot_that_cannot_be_written_leaves_nothing(tmp_path, rows):
     with pytest.raises(OSError, match="file"):
         plots.plot_dataset(blocked / "a.svg", rows, "set R")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_thinned_line_keeps_its_ends_its_peaks_and_its_gaps():
+    y = np.zeros(5000)
+    y[[1234, 1235, 4000]] = 7.0, -7.0, np.nan
+    y[2000:2100] = np.nan
+    rows = plots.outline(y, 200)
+    assert 100 < len(rows) <= 200
+    assert rows[0] == 0
+    assert rows[-1] == 4999
+    assert {1234, 1235} <= set(rows.tolist())
+    assert np.all(np.diff(rows) > 0)
+    assert np.isnan(y[rows]).any(), "a gap stays a gap"
+    assert plots.outline(y, 5000).tolist() == list(range(5000))
+
+
+def test_a_path_is_one_line_of_hundredths(tmp_path):
+    figure = Figure()
+    figure.subplots().plot(np.random.default_rng(1).normal(size=400))
+    plots.save(figure, tmp_path / "a.svg")
+    paths = re.findall(r' d="([^"]*)"', (tmp_path / "a.svg").read_text())
+    assert max(path.count("L") for path in paths) > 300
+    assert not any("\n" in path or re.search(r"\.\d{3}", path) for path in paths)
+    plain = io.BytesIO()
+    figure.savefig(plain, format="svg")
+    drawn = max(re.findall(r' d="([^"]*)"', plain.getvalue().decode()), key=len)
+    kept = max(paths, key=len)
+    numbers = [np.array(re.findall(r"-?[\d.]+", path), dtype=float) for path in (drawn, kept)]
+    np.testing.assert_allclose(numbers[1], numbers[0], rtol=0, atol=0.00501)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from tools.estimators.drive import DELAY_STEPS, OFFSET_DEGC, Drive, Estimates
 from tools.estimators.jit import compiled
-from tools.estimators.net import Net, memory_size, scratch_size, step
+from tools.estimators.net import Net, memory_size, run_ahead, scratch_size, step
 from tools.estimators.session import ArraySession
-from tools.estimators.start import EARLY, SPIN_UP_STEPS, begins
+from tools.estimators.start import EARLY, begins, start_up
 
 Array = NDArray[np.float64]
 
@@ -54,19 +54,12 @@ def _observe(net, gain, gate, memory, u, y, first, last, scratch, out):
         if early[4] == 0.0:
             if not begins(early, y[row], row):
                 continue
-            for ch in range(2):
-                state[ch] = early[ch] / early[2 + ch]
-            start_w, start_r = state[0], state[1]
-            for _ in range(SPIN_UP_STEPS):
-                step(net, u[node + 1], state, scratch)
-                state[0], state[1] = start_w, start_r
+            start_up(net, early, u[node + 1], state, scratch)
         else:
             step(net, u[node], state, scratch)
         for ch in range(2):
             innovation = y[row, ch] - OFFSET_DEGC - state[ch]
             if abs(innovation) <= gate[ch]:  # false for NaN too
                 state[ch] += gain[ch] * innovation
-        ahead[:] = state
-        for k in range(node + 1, row + 1):
-            step(net, u[k], ahead, scratch)
+        run_ahead(net, u, node + 1, row, state, ahead, scratch)
         out[row - first, 0], out[row - first, 1] = ahead[0], ahead[1]

@@ -121,3 +121,11 @@ def step(net, u, state, scratch):
         for j in range(hidden):
             rate += net.w_y[i, j] * value[j]
         state[i] += net.dt_s * (net.out_offset[i] + net.out_scale[i] * rate)
+
+
+@compiled
+def run_ahead(net, u, first, last, state, ahead, scratch):
+    """`ahead` = `state` moved on by rows first .. last of u; `state` stays."""
+    ahead[:] = state
+    for k in range(first, last + 1):
+        step(net, u[k], ahead, scratch)

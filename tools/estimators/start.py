@@ -10,6 +10,7 @@ import numpy as np
 
 from tools.estimators.drive import DELAY_STEPS, OFFSET_DEGC
 from tools.estimators.jit import compiled
+from tools.estimators.net import step
 
 SPIN_UP_STEPS = 5  # fill the net's empty memory with the first input
 PRIOR_VARIANCE_K2 = 10.0  # of the start temperatures
@@ -27,3 +28,14 @@ def begins(early, y, row):
             early[ch] += y[ch] - OFFSET_DEGC
             early[2 + ch] += 1.0
     return False
+
+
+@compiled
+def start_up(net, early, u, state, scratch):
+    """Put `state` where the early measurements stood, its memory filled with the first known input."""
+    for ch in range(2):
+        state[ch] = early[ch] / early[2 + ch]
+    start_w, start_r = state[0], state[1]
+    for _ in range(SPIN_UP_STEPS):
+        step(net, u, state, scratch)
+        state[0], state[1] = start_w, start_r

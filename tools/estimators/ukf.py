@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from tools.estimators.drive import DELAY_STEPS, OFFSET_DEGC, Drive, Estimates
 from tools.estimators.jit import compiled
-from tools.estimators.net import Net, memory_size, scratch_size, step
+from tools.estimators.net import Net, memory_size, run_ahead, scratch_size, step
 from tools.estimators.session import ArraySession
-from tools.estimators.start import EARLY, PRIOR_VARIANCE_K2, SPIN_UP_STEPS, begins
+from tools.estimators.start import EARLY, PRIOR_VARIANCE_K2, begins, start_up
 
 Array = NDArray[np.float64]
 
@@ -62,13 +62,9 @@ def _filter(net, q, r, gate, memory, u, y, first, last, scratch, out):
         if early[4] == 0.0:
             if not begins(early, y[row], row):
                 continue
+            start_up(net, early, u[node + 1], mean, scratch)
             for ch in range(2):
-                mean[ch] = early[ch] / early[2 + ch]
                 cov[ch, ch] = PRIOR_VARIANCE_K2
-            start_w, start_r = mean[0], mean[1]
-            for _ in range(SPIN_UP_STEPS):
-                step(net, u[node + 1], mean, scratch)
-                mean[0], mean[1] = start_w, start_r
         else:
             _predict(net, q, u[node], mean, cov, points, root, scratch)
         for ch in range(2):
@@ -76,9 +72,7 @@ def _filter(net, q, r, gate, memory, u, y, first, last, scratch, out):
             variance = cov[ch, ch] + r[ch]
             if abs(innovation) <= gate * np.sqrt(variance):  # false for NaN too
                 correct(mean, cov, ch, innovation, variance)
-        ahead[:] = mean
-        for k in range(node + 1, row + 1):
-            step(net, u[k], ahead, scratch)
+        run_ahead(net, u, node + 1, row, mean, ahead, scratch)
         for ch in range(2):
             out[row - first, ch] = ahead[ch]
 

@@ -17,8 +17,8 @@ class Config:
     ----------
     name, title : str
         Of the row.
-    library, variant : str
-        Which shared library, and what backend_open() is told.
+    build, variant : str
+        Which build of which solver (DOUBLE, FLOAT, HPIPM), and what backend_open() is told.
     sweeps : int
         Exactly so many linear solves a step; 0: until the setting's tolerance is met.
     tolerance_degc : float
@@ -33,7 +33,7 @@ class Config:
 
     name: str
     title: str
-    library: str
+    build: str
     variant: str
     sweeps: int = 0
     tolerance_degc: float = 0.0
@@ -72,7 +72,7 @@ CONFIGS = (
     Config("f32_2", "θ-space, portable C, float, two sweeps", FLOAT, "", sweeps=2),
     Config("hpipm_rti", "one SQP iteration + HPIPM, fully condensed, bounds where met", HPIPM, "full-free", sweeps=1),
 )  # fmt: skip
-HPIPM_NAMES = tuple(c.name for c in CONFIGS if c.library == HPIPM and c.sweeps == 0 and c.loss < 0)
+HPIPM_NAMES = tuple(c.name for c in CONFIGS if c.build == HPIPM and c.sweeps == 0 and c.loss < 0)
 
 
 class UnknownBackend(Exception):

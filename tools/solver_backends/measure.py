@@ -35,14 +35,14 @@ class Bench:
         built: dict[str, Path] = {}
         self._words: list[str] = []
         for place, config in enumerate(self.configs):
-            if config.library not in built:
-                built[config.library] = {
+            if config.build not in built:
+                built[config.build] = {
                     DOUBLE: lambda: build_mhe(weights, folder),
                     FLOAT: lambda: build_mhe(weights, folder, FLOAT_TYPE),
                     HPIPM: lambda: build_hpipm(weights, folder),
-                }[config.library]()
+                }[config.build]()
             own = folder / f"{place}-{config.name}.so"
-            shutil.copy(built[config.library], own)
+            shutil.copy(built[config.build], own)
             self._words.append(config.words(str(own)))
 
     def runs(self, place: int) -> bool:
