@@ -254,17 +254,21 @@ def test_single_samples_and_a_copy_in_between_give_the_same_bytes():
     assert np.isnan(whole[window(8, 8.5), 0]).all()
 
 
-def test_a_lap_of_readings_is_quick():
+def test_a_lap_of_readings_costs_less_than_a_twentieth_of_it_sample_by_sample():
     theta = np.tile(truth(), (36, 1))[:LAP_SAMPLES]
     texts = [
         "offset:-20@1-714", "noise:5@1-714", "spike:2%@1-714", "drift:-0.05@1-714", "slow:15@1-714/wr", "delay:3@1-714"
     ]  # fmt: skip
-    best = np.inf
+    whole_s = np.inf
     for _ in range(5):
         start = time.perf_counter()
         assert read(*texts, theta=theta).shape == (LAP_SAMPLES, 2)
-        best = min(best, time.perf_counter() - start)
-    assert best < 0.020, f"{best * 1e3:.1f} ms"
+        whole_s = min(whole_s, time.perf_counter() - start)
+    sensor = TemperatureSensor(PARAMS.sensor, theta[0], np.random.default_rng(3), [parse_fault(t) for t in texts])
+    start = time.perf_counter()
+    for row in theta[: LAP_SAMPLES // 20]:
+        sensor.sample(row[None, :])
+    assert whole_s < time.perf_counter() - start
 
 
 # ---- the plant --------------------------------------------------------------------------------------------------
