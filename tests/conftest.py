@@ -22,6 +22,10 @@ ALONE = (
     "browser/", "bus/", "faults/", "timing/",
     "unit/test_rt_threads.py", "unit/test_rt_grant.py", "unit/test_bench_loop.py", "unit/test_pytest_plugin.py",
 )  # fmt: skip
+LOCKSTEP = (  # no clock runs there
+    "timing/test_estimator_binary_lockstep.py", "timing/test_estimator_binary_replay.py",
+    "timing/test_mil.py", "timing/test_mil_faults.py",
+)  # fmt: skip
 
 # A shell that starts us in the background makes SIGINT ignored, and every process we start would inherit that: Ctrl-C
 # could not be tested.
@@ -48,5 +52,6 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        if item.path.relative_to(HERE).as_posix().startswith(ALONE):
+        name = item.path.relative_to(HERE).as_posix()
+        if name.startswith(ALONE) and name not in LOCKSTEP:
             item.add_marker("alone")
