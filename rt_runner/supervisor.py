@@ -24,6 +24,7 @@ READY_S = 90.0  # the plant compiles its kernel at first use and drives to the s
 ESTIMATOR_DRAIN_S = 0.25
 WORKER_END_S = 12.0  # on a bus that lags behind the estimator leaves only when all it sent is on it
 STOPPED_BY_MISSES = 2  # how the estimator ends when its policy stops it
+RESTART_PAUSE_S = 0.5  # what dies at once must not be started in a storm; the plant's own fallback is due after 0.2 s
 RESTARTS_MAX = 3  # of one process, where a controller closes the loop; without one, a process that ends fails the run
 
 
@@ -188,6 +189,7 @@ class Supervisor:
             raise ChildError(obituary)
         self._restarts.append(obituary)
         self._say(f"warning: {obituary}; it is started again")
+        time.sleep(RESTART_PAUSE_S)
         self._start_worker(name, bus)
 
     def _restarted(self, name: str) -> int:
