@@ -1,7 +1,7 @@
 """For all tests: which of them want the machine for themselves, one folder of compiled libraries, SIGINT as a terminal.
 
-Tests of real processes in real time are marked ``alone``, by their place here or by themselves. `tools/run-tests` runs
-them one after the other, and everything else two at a time.
+Tests that judge the times of real processes are marked ``alone``, by their place here or by themselves. `tools/run-tests`
+runs them one after the other, and everything else side by side.
 """
 
 import os
@@ -19,7 +19,7 @@ settings.register_profile("house", deadline=None)
 settings.load_profile("house")
 
 ALONE = (
-    "browser/", "bus/", "faults/", "timing/",
+    "timing/", "bus/test_plugin_examples.py",
     "unit/test_rt_threads.py", "unit/test_rt_grant.py", "unit/test_bench_loop.py", "unit/test_pytest_plugin.py",
 )  # fmt: skip
 LOCKSTEP = (  # no clock runs there
