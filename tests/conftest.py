@@ -1,7 +1,7 @@
 """For all tests: which of them want the machine for themselves, one folder of compiled libraries, SIGINT as a terminal.
 
-Tests that judge the times of real processes are marked ``alone``, by their place here or by themselves. `tools/run-tests`
-runs them one after the other, and everything else side by side.
+Tests that judge the times of real processes are marked ``alone``, by their place here or by themselves.
+`tools/run-tests` runs them one after the other, and everything else side by side.
 """
 
 import os
